@@ -1,0 +1,2 @@
+//! The `vbar` command.
+fn main() {}

@@ -1,0 +1,1 @@
+//! vbar client.

@@ -1,0 +1,5 @@
+//! Dynamics of relative motion.
+
+mod scaling;
+
+pub use scaling::HillScaling;
