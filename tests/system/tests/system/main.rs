@@ -1,0 +1,3 @@
+//! The whole house: its rules, and real nodes.
+
+mod tidy;
