@@ -34,18 +34,22 @@ const FOR_TESTS: [(&str, &[&str]); 2] =
 
 /// Modules of the server, which of each other they may use, and which crates of ours.
 const SERVER: [(&str, &[&str], &[&str]); 8] = [
-    ("config", &[], &[]),
-    ("telemetry", &["config"], &[]),
-    ("store", &["config"], &[]),
-    ("compute", &["config", "telemetry"], &["vbar_guidance"]),
-    ("wire", &["config"], &["vbar_proto", "vbar_guidance"]),
+    ("telemetry", &[], &[]),
+    ("store", &[], &[]),
+    ("compute", &["telemetry"], &["vbar_guidance"]),
+    ("wire", &[], &["vbar_proto", "vbar_guidance"]),
+    ("config", &["wire"], &[]),
     (
         "service",
         &["config", "telemetry", "store", "compute", "wire"],
-        &["vbar_proto", "vbar_guidance"],
+        &["vbar_guidance"],
     ),
     ("transport", &["config", "telemetry", "service", "wire"], &["vbar_proto"]),
-    ("node", &["config", "telemetry", "store", "compute", "service", "transport"], &[]),
+    (
+        "node",
+        &["config", "telemetry", "store", "compute", "wire", "service", "transport"],
+        &[],
+    ),
 ];
 
 /// Only the named folders stand at the root.

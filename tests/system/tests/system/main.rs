@@ -1,3 +1,5 @@
-//! The whole house: its rules, and real nodes.
+//! The whole house: its rules, real nodes, and what the README shows.
 
+mod nodes;
+mod readme;
 mod tidy;
