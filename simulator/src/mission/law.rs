@@ -227,8 +227,10 @@ impl DisturbanceLaw {
     ) {
         let hill = matches!(model.kind, Kind::Hill(_));
         let two_body = matches!(truth, TruthLaw::TwoBody(_));
-        let additive =
-            matches!(self, Self::Uniform | Self::Vertices | Self::ConstantVertex | Self::Constant { .. });
+        let additive = matches!(
+            self,
+            Self::Uniform | Self::Vertices | Self::ConstantVertex | Self::Constant { .. }
+        );
         if additive && two_body {
             faults.push(format!("{place}: additive laws need the linear truth"));
         }
@@ -301,9 +303,7 @@ impl RunDisturbance {
         match self {
             Self::None | Self::Misalignment(_) => DVector::zeros(states),
             Self::Constant(components) => components.clone(),
-            Self::Uniform => {
-                sample(&model.disturbance, states, &mut || uniform(chance, -1.0, 1.0))
-            }
+            Self::Uniform => sample(&model.disturbance, states, &mut || uniform(chance, -1.0, 1.0)),
             Self::Vertices => sample(&model.disturbance, states, &mut || sign(chance)),
         }
     }
@@ -322,11 +322,7 @@ fn sign(chance: &mut impl Rng) -> f64 {
     if chance.random::<bool>() { 1.0 } else { -1.0 }
 }
 
-fn sample(
-    set: &DisturbanceModel,
-    states: usize,
-    factor: &mut dyn FnMut() -> f64,
-) -> DVector<f64> {
+fn sample(set: &DisturbanceModel, states: usize, factor: &mut dyn FnMut() -> f64) -> DVector<f64> {
     match set {
         DisturbanceModel::None | DisturbanceModel::Misalignment => DVector::zeros(states),
         DisturbanceModel::Box(half_widths) => half_widths.map(|half_width| half_width * factor()),
@@ -379,7 +375,9 @@ impl Randomisation {
         let acceleration = self.acceleration_max_m_s2.map(|[l, u]| uniform(chance, l, u));
         let period = self.spin_period_s.map(|[l, u]| uniform(chance, l, u));
         let Some(inner) = variable_horizon_mut(problem) else { return };
-        let Some(v1::variable_horizon_problem::Plant::Hill(hill)) = &mut inner.plant else { return };
+        let Some(v1::variable_horizon_problem::Plant::Hill(hill)) = &mut inner.plant else {
+            return;
+        };
         if acceleration.is_some() {
             hill.acceleration_max_m_s2 = acceleration;
         }

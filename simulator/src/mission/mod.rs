@@ -187,7 +187,8 @@ impl Mission {
     /// The scheme that the problem itself names.
     #[must_use]
     pub fn scheme(&self) -> Scheme {
-        variable_horizon(&self.problem).map_or(Scheme::Unspecified, v1::VariableHorizonProblem::scheme)
+        variable_horizon(&self.problem)
+            .map_or(Scheme::Unspecified, v1::VariableHorizonProblem::scheme)
     }
 
     /// The schemes flown when all are asked for, in the order of the file.
@@ -196,7 +197,7 @@ impl Mission {
         self.simulation.compared_schemes.iter().filter_map(|name| scheme_named(name)).collect()
     }
 
-    fn check(&self) -> Result<(), MissionError> {
+    pub(crate) fn check(&self) -> Result<(), MissionError> {
         let mut faults = Vec::new();
         let name_ok = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
         if self.name.is_empty() || !self.name.chars().all(name_ok) {
@@ -291,9 +292,7 @@ fn parse_problem(json: serde_json::Value) -> Result<v1::Problem, MissionError> {
         .ok_or_else(|| MissionError::Invalid(vec!["the contract has no Problem".into()]))?;
     let options = DeserializeOptions::new().deny_unknown_fields(true);
     let message = DynamicMessage::deserialize_with_options(descriptor, json, &options)?;
-    message
-        .transcode_to()
-        .map_err(|fault| MissionError::Invalid(vec![format!("problem: {fault}")]))
+    message.transcode_to().map_err(|fault| MissionError::Invalid(vec![format!("problem: {fault}")]))
 }
 
 #[cfg(test)]

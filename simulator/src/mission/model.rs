@@ -33,7 +33,7 @@ pub(crate) struct Model {
 #[derive(Debug, Clone)]
 pub(crate) enum Kind {
     Hill(Box<HillModel>),
-    Linear(LinearModel),
+    Linear(Box<LinearModel>),
 }
 
 /// A chaser near a rotating target.
@@ -188,7 +188,8 @@ fn hill_model(
     positive("sampling", dt, faults);
     let acceleration_max_m_s2 = hill.acceleration_max_m_s2.unwrap_or(f64::NAN);
     positive("acceleration_max_m_s2", acceleration_max_m_s2, faults);
-    let sampled = matches!(hill.rotation, Some(v1::TargetRotation { motion: Some(Motion::Sampled(_)) }));
+    let sampled =
+        matches!(hill.rotation, Some(v1::TargetRotation { motion: Some(Motion::Sampled(_)) }));
     let capture_m = match hill.capture_point_m.is_empty() && sampled {
         true => Vector3::zeros(),
         false => three(&format!("{HILL}.capture_point_m"), &hill.capture_point_m, faults),
@@ -206,8 +207,13 @@ fn hill_model(
     }
     let motion = body_motion(hill.rotation.as_ref(), eta, dt, samples, faults)?;
     let target = Target { motion, capture_m, port_m, sample_time_s: dt };
-    let model =
-        HillModel { mean_motion_rad_s: eta, sample_time_s: dt, acceleration_max_m_s2, target, cone };
+    let model = HillModel {
+        mean_motion_rad_s: eta,
+        sample_time_s: dt,
+        acceleration_max_m_s2,
+        target,
+        cone,
+    };
     let disturbance = scale_si_box(disturbance?, hill.disturbance.as_ref(), &model);
     Some((Kind::Hill(Box::new(model)), disturbance))
 }
@@ -304,7 +310,12 @@ fn torque_free(
         }
     };
     let rate_body = rate.map(f64::to_radians);
-    faults.is_empty().then_some(TorqueFreeBody { inertia, rtn_from_body, rate_body, frame_rate_rad_s })
+    faults.is_empty().then_some(TorqueFreeBody {
+        inertia,
+        rtn_from_body,
+        rate_body,
+        frame_rate_rad_s,
+    })
 }
 
 fn body_points(
@@ -372,7 +383,7 @@ fn linear_model(
     }
     let plant = LinearPlant { a, b };
     let model = LinearModel { plant, input_lower, input_upper, input_set, state_set, reference };
-    Some((Kind::Linear(model), disturbance?))
+    Some((Kind::Linear(Box::new(model)), disturbance?))
 }
 
 fn half_spaces(

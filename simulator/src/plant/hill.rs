@@ -26,13 +26,12 @@ impl HillPlant {
     }
 
     /// The state one sample later: `state` is [position m, velocity m/s], `acceleration` m/s^2.
-    pub(crate) fn advance(&self, state: &Vector6<f64>, acceleration: &Vector3<f64>) -> Vector6<f64> {
+    pub(crate) fn advance(
+        &self,
+        state: &Vector6<f64>,
+        acceleration: &Vector3<f64>,
+    ) -> Vector6<f64> {
         self.transition * state + self.forcing * acceleration
-    }
-
-    /// What an acceleration alone does over one sample.
-    pub(crate) fn response(&self, acceleration: &Vector3<f64>) -> Vector6<f64> {
-        self.forcing * acceleration
     }
 }
 
@@ -147,7 +146,8 @@ mod tests {
     #[test]
     fn hill_matrices_agree_with_reference_cases() {
         let mut checked = 0;
-        let files = ["adversarial.json", "envisat_p0.json", "mc000_p0.json", "tumbling_sat_003.json"];
+        let files =
+            ["adversarial.json", "envisat_p0.json", "mc000_p0.json", "tumbling_sat_003.json"];
         for case in files.iter().flat_map(|file| golden_cases(file)) {
             let physical = &case["physical"];
             let Some(eta) = physical["eta"].as_f64() else { continue };
