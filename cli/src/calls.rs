@@ -35,12 +35,10 @@ pub(crate) struct PlanArguments {
     /// other its open-loop plan
     #[arg(long, value_name = "SCHEME")]
     scheme: Option<SchemeChoice>,
-    /// File with a Measurement as JSON to start from; - is standard input
+    /// File with a Measurement as JSON to start from; - is standard input. Needed where the
+    /// mission draws its first state by chance
     #[arg(long, value_name = "FILE")]
     initial: Option<PathBuf>,
-    /// Seed of a mission that draws its first state by chance
-    #[arg(long, value_name = "S", default_value_t = 1)]
-    seed: u64,
 }
 
 /// Everything the decision needs is in the request.
@@ -81,9 +79,9 @@ pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
     let mission = load(&arguments.mission, arguments.scheme)?;
     let initial: Measurement = match &arguments.initial {
         Some(path) => json::parse(&read(path)?)?,
-        None => {
-            mission.start(arguments.seed).map_err(|fault| Failure::data(fault.to_string()))?
-        }
+        None => mission.fixed_start().ok_or_else(|| {
+            Failure::usage("this mission draws its first state by chance: give --initial FILE")
+        })?,
     };
     let request = ComputePlanRequest {
         problem: Some(mission.problem),

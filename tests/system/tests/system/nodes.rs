@@ -101,7 +101,7 @@ async fn fly(
 #[tokio::test]
 async fn loop_goes_on_with_another_node_as_if_nothing_had_happened() {
     let mission = envisat();
-    let start = mission.start(1).unwrap();
+    let start = mission.fixed_start().unwrap();
     let controller = Controller::Problem(mission.problem);
     let (mut first, second) = (Mortal::start(Config::default()), Mortal::start(Config::default()));
     let undisturbed = client(&second).await.closed_loop(controller.clone()).await.unwrap();
@@ -129,7 +129,7 @@ async fn nodes_answer_the_same_request_with_the_same_bytes() {
         controller: Some(vbar_client::v1::step_request::Controller::Problem(
             mission.problem.clone(),
         )),
-        measurement: Some(mission.start(1).unwrap()),
+        measurement: Some(mission.fixed_start().unwrap()),
         ..Default::default()
     };
     let mut seen = Vec::new();
@@ -164,7 +164,7 @@ async fn precompute_names_what_a_step_can_use_and_a_restarted_node_still_knows()
         vbar_client::v1::step_request::Controller::ArtifactId(artifact.artifact_id.clone());
     let request = vbar_client::v1::StepRequest {
         controller: Some(controller),
-        measurement: Some(mission.start(1).unwrap()),
+        measurement: Some(mission.fixed_start().unwrap()),
         ..Default::default()
     };
     let answer = client.step(request).await.unwrap();
