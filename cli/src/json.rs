@@ -18,9 +18,8 @@ pub(crate) fn parse<M: Message + Name + Default>(text: &str) -> Result<M, Failur
     let refused = |fault: serde_json::Error| Failure::data(format!("not a {}: {fault}", M::NAME));
     let mut reader = serde_json::Deserializer::from_str(text);
     let options = DeserializeOptions::new().deny_unknown_fields(true);
-    let message =
-        DynamicMessage::deserialize_with_options(descriptor, &mut reader, &options)
-            .map_err(refused)?;
+    let message = DynamicMessage::deserialize_with_options(descriptor, &mut reader, &options)
+        .map_err(refused)?;
     reader.end().map_err(refused)?;
     message.transcode_to().map_err(|fault| Failure::ours(fault.to_string()))
 }

@@ -15,10 +15,8 @@ use vbar_server::{Config, Node, Settings};
 use crate::{failure::Failure, json};
 
 /// Where a node listens unless told otherwise.
-const LISTEN_DEFAULT: SocketAddr = SocketAddr::V4(std::net::SocketAddrV4::new(
-    std::net::Ipv4Addr::LOCALHOST,
-    7440,
-));
+const LISTEN_DEFAULT: SocketAddr =
+    SocketAddr::V4(std::net::SocketAddrV4::new(std::net::Ipv4Addr::LOCALHOST, 7440));
 /// Largest configuration file that is read.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Variables with our prefix that are not settings of a node.

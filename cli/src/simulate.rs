@@ -45,8 +45,13 @@ pub(crate) struct SimulateArguments {
     variant: Option<String>,
     /// Turn the thrust by these angles about R, T and N, in degrees, instead of the mission's
     /// disturbance
-    #[arg(long, value_name = "R,T,N", value_delimiter = ',', num_args = 3,
-          allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "R,T,N",
+        value_delimiter = ',',
+        num_args = 3,
+        allow_negative_numbers = true
+    )]
     misalignment_deg: Option<Vec<f64>>,
     /// Ask for every step with both searches and count the answers that differ
     #[arg(long)]
@@ -88,8 +93,7 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
     let options = options(&arguments)?;
     let session = Session::open(&arguments.node).await?;
     let progress = ProgressBar::default();
-    let flown =
-        vbar_simulator::simulate(&session.client, &mission, &options, &progress).await;
+    let flown = vbar_simulator::simulate(&session.client, &mission, &options, &progress).await;
     session.close().await;
     let report = flown.map_err(failure)?;
     match arguments.format {

@@ -188,10 +188,8 @@ fn step_that_makes_no_sense_exits_65_and_says_why() {
 fn simulate_prints_the_report_as_json() {
     let arguments =
         ["--runs", "3", "--seed", "1", "--format", "json", "--no-pictures", "--scheme", "all"];
-    let flown = vbar(&["simulate", &mission("double_integrator.json")])
-        .args(arguments)
-        .output()
-        .unwrap();
+    let flown =
+        vbar(&["simulate", &mission("double_integrator.json")]).args(arguments).output().unwrap();
     assert_eq!(flown.status.code(), Some(0), "{}", text(&flown.stderr));
     let report: Value = serde_json::from_slice(&flown.stdout).unwrap();
     assert!(report.is_object(), "{report}");

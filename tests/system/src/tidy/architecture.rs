@@ -39,17 +39,9 @@ const SERVER: [(&str, &[&str], &[&str]); 8] = [
     ("compute", &["telemetry"], &["vbar_guidance"]),
     ("wire", &[], &["vbar_proto", "vbar_guidance"]),
     ("config", &["wire"], &[]),
-    (
-        "service",
-        &["config", "telemetry", "store", "compute", "wire"],
-        &["vbar_guidance"],
-    ),
+    ("service", &["config", "telemetry", "store", "compute", "wire"], &["vbar_guidance"]),
     ("transport", &["config", "telemetry", "service", "wire"], &["vbar_proto"]),
-    (
-        "node",
-        &["config", "telemetry", "store", "compute", "wire", "service", "transport"],
-        &[],
-    ),
+    ("node", &["config", "telemetry", "store", "compute", "wire", "service", "transport"], &[]),
 ];
 
 /// Only the named folders stand at the root.

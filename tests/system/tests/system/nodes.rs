@@ -65,9 +65,8 @@ async fn client(node: &Mortal) -> Client {
 fn next_measurement(answer: &StepResponse) -> Option<Measurement> {
     let Some(Verdict::Command(command)) = &answer.verdict else { return None };
     let prediction = answer.prediction.as_ref().unwrap();
-    let row = |matrix: &Option<vbar_client::v1::Matrix>| {
-        matrix.as_ref().unwrap().values[3..6].to_vec()
-    };
+    let row =
+        |matrix: &Option<vbar_client::v1::Matrix>| matrix.as_ref().unwrap().values[3..6].to_vec();
     let mut velocity_m_s = row(&prediction.velocities_m_s);
     // Far inside the assumed set: 1 degree of misalignment at full thrust gives 10 mm/s here.
     velocity_m_s[answer.step_index as usize % 3] += 1e-3;
@@ -106,7 +105,11 @@ async fn loop_goes_on_with_another_node_as_if_nothing_had_happened() {
     let (mut first, second) = (Mortal::start(Config::default()), Mortal::start(Config::default()));
     let undisturbed = client(&second).await.closed_loop(controller.clone()).await.unwrap();
     let (_, whole, _) = fly(undisturbed, start.clone(), usize::MAX).await.unwrap();
-    assert!(matches!(whole.last().unwrap().verdict, Some(Verdict::Arrived(_))), "{:?}", whole.last());
+    assert!(
+        matches!(whole.last().unwrap().verdict, Some(Verdict::Arrived(_))),
+        "{:?}",
+        whole.last()
+    );
 
     let flight = client(&first).await.closed_loop(controller.clone()).await.unwrap();
     let (mut flight, mut answers, _) = fly(flight, start, 6).await.unwrap();
