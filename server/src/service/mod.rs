@@ -17,6 +17,7 @@ use vbar_guidance::{
     control::{Certificate, PrepareError, StepError},
 };
 
+pub(crate) use crate::compute::Timed;
 pub(crate) use error::{Code, Error};
 pub(crate) use session::{Session, SessionAnswer};
 
