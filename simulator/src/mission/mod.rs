@@ -7,6 +7,7 @@
 
 pub(crate) mod law;
 pub(crate) mod model;
+mod start;
 
 use std::{collections::BTreeMap, fs, path::Path};
 
