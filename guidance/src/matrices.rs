@@ -14,13 +14,15 @@ pub(crate) fn times_vector(a: &DMatrix<f64>, x: &DVector<f64>) -> DVector<f64> {
     DVector::from_fn(a.nrows(), |i, _| (0..a.ncols()).map(|k| a[(i, k)] * x[k]).sum())
 }
 
-/// Least-norm least-squares solution of A x = b, by singular values.
-pub(crate) fn least_squares(a: &DMatrix<f64>, b: &DVector<f64>) -> DVector<f64> {
+/// Pseudo-inverse and rank, by singular values above 1e-12 of the largest.
+pub(crate) fn pseudo_inverse(a: &DMatrix<f64>) -> (DMatrix<f64>, usize) {
     let scale = a.amax();
-    if scale == 0.0 {
-        return DVector::zeros(a.ncols());
+    let none = || (DMatrix::zeros(a.ncols(), a.nrows()), 0);
+    if a.ncols() == 0 || scale == 0.0 {
+        return none();
     }
-    // Columns and rows of a state can differ by many orders of magnitude: relative cut-off.
     let svd = (a / scale).svd(true, true);
-    svd.solve(&(b / scale), 1e-12).unwrap_or_else(|_| DVector::zeros(a.ncols()))
+    let cut_off = 1e-12 * svd.singular_values.amax();
+    let rank = svd.rank(cut_off);
+    svd.pseudo_inverse(cut_off).map_or_else(|_| none(), |inverse| (inverse / scale, rank))
 }

@@ -1,5 +1,9 @@
-//! Dynamics of relative motion.
+//! Dynamics of relative motion, and feedback gains for them.
 
+mod clohessy_wiltshire;
+mod gain;
 mod scaling;
 
+pub use clohessy_wiltshire::clohessy_wiltshire;
+pub use gain::{GainError, linear_quadratic_regulator, place_poles, spectral_radius};
 pub use scaling::HillScaling;

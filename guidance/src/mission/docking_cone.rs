@@ -1,6 +1,6 @@
 //! The docking cone and its four faces.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
 use crate::units::Angle;
 
@@ -52,6 +52,58 @@ impl DockingCone {
         ConeFaces {
             normals: [u, -u, v, -v].map(|side| side - axis * slope),
             offsets: [-slope * length; CONE_FACES],
+        }
+    }
+}
+
+impl ConeFaces {
+    /// The point with normals * p <= offsets nearest to `point`; exact, by trying the sets of
+    /// faces that can be active. `None` if there is none.
+    ///
+    /// This is z^r of [Quartullo2025a, eq. 21] in the position part; the velocity part is the
+    /// reference's own, because the faces do not touch it.
+    #[must_use]
+    pub fn nearest_point(&self, point: Vector3<f64>) -> Option<Vector3<f64>> {
+        // Relative to the size of the offsets' rounding.
+        let scale = self.offsets.iter().fold(point.norm(), |a, b| a.max(b.abs()));
+        let tolerance = 1e-12 * scale;
+        let inside = |p: &Vector3<f64>| {
+            (0..CONE_FACES).all(|i| self.normals[i].dot(p) <= self.offsets[i] + tolerance)
+        };
+        if inside(&point) {
+            return Some(point);
+        }
+        let mut nearest: Option<(f64, Vector3<f64>)> = None;
+        // Bit i set: face i active. More than three active faces meet three of them already.
+        for active in 1u8..(1 << CONE_FACES) - 1 {
+            let Some(candidate) = self.onto_faces(active, point) else { continue };
+            let distance = (candidate - point).norm();
+            if inside(&candidate) && nearest.is_none_or(|(least, _)| distance < least) {
+                nearest = Some((distance, candidate));
+            }
+        }
+        nearest.map(|(_, candidate)| candidate)
+    }
+
+    /// Projection onto the intersection of the planes of the faces in `active`.
+    fn onto_faces(&self, active: u8, point: Vector3<f64>) -> Option<Vector3<f64>> {
+        let mut faces = (0..CONE_FACES).filter(|i| active >> i & 1 == 1);
+        let (first, second, third) = (faces.next()?, faces.next(), faces.next());
+        let miss = |i: usize| self.normals[i].dot(&point) - self.offsets[i];
+        let h = &self.normals;
+        match (second, third) {
+            (None, _) => Some(point - h[first] * (miss(first) / h[first].norm_squared())),
+            (Some(second), None) => {
+                let pair = [first, second];
+                let gram = Matrix2::from_fn(|i, j| h[pair[i]].dot(&h[pair[j]]));
+                let weights = gram.try_inverse()? * Vector2::new(miss(first), miss(second));
+                Some(point - h[first] * weights.x - h[second] * weights.y)
+            }
+            (Some(second), Some(third)) => {
+                let rows = [h[first], h[second], h[third]].map(|face| face.transpose());
+                let offsets = [first, second, third].map(|i| self.offsets[i]);
+                Matrix3::from_rows(&rows).try_inverse().map(|m| m * Vector3::from(offsets))
+            }
         }
     }
 }
@@ -114,6 +166,30 @@ mod tests {
         let near = cone(0.0).faces(Vector3::new(-1.5, 1e-9, 0.0));
         for i in 0..CONE_FACES {
             assert!((at.normals[i] - near.normals[i]).norm() < 1e-8);
+        }
+    }
+
+    #[test]
+    fn nearest_point_satisfies_the_optimality_conditions() {
+        let faces = {
+            let mut faces = cone(12.0).faces(Vector3::new(-1.2, 0.7, 0.4));
+            // Tightened unevenly, so that the apex is no longer common to all faces.
+            for (i, offset) in faces.offsets.iter_mut().enumerate() {
+                *offset -= 0.1 + 0.05 * f64::from(u8::try_from(i).unwrap());
+            }
+            faces
+        };
+        for (x, y, z) in [(0.0, 0.0, 0.0), (1.0, -2.0, 0.3), (-5.0, 0.0, 0.0), (-1.5, 0.9, 3.0)] {
+            let point = Vector3::new(x, y, z);
+            let nearest = faces.nearest_point(point).unwrap();
+            // Feasible, and every feasible point lies on the far side of the normal plane.
+            for i in 0..CONE_FACES {
+                assert!(faces.normals[i].dot(&nearest) <= faces.offsets[i] + 1e-12);
+            }
+            for inside in [Vector3::new(-12.0, 7.0, 4.0), Vector3::new(-14.0, 7.0, 5.0)] {
+                assert!(faces.nearest_point(inside) == Some(inside));
+                assert!((point - nearest).dot(&(inside - nearest)) <= 1e-10);
+            }
         }
     }
 }

@@ -4,7 +4,7 @@ mod polytope;
 mod zonotope;
 
 pub use polytope::Polytope;
-pub use zonotope::{Zonotope, ZonotopeGauge};
+pub use zonotope::{Zonotope, ZonotopeGauge, ZonotopeMeasure};
 
 use nalgebra::DVector;
 

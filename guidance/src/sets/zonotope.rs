@@ -22,6 +22,56 @@ pub struct ZonotopeGauge {
     pub residual_norm: f64,
 }
 
+/// A zonotope with the pseudo-inverse of its generators.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ZonotopeMeasure {
+    zonotope: Zonotope,
+    pseudo_inverse: DMatrix<f64>,
+    rank: usize,
+    size: f64,
+}
+
+impl ZonotopeMeasure {
+    /// Measures `point - centre`.
+    ///
+    /// Exact if the generators are linearly independent. Otherwise the least-norm coefficients
+    /// are taken, which is an upper bound on the gauge: it can call a point outside that is
+    /// inside, never the reverse.
+    #[must_use]
+    pub fn gauge(&self, point: &DVector<f64>) -> ZonotopeGauge {
+        let difference = point - &self.zonotope.centre;
+        if self.rank == 0 {
+            return ZonotopeGauge { gauge: None, residual_norm: difference.norm() };
+        }
+        let coefficients = matrices::times_vector(&self.pseudo_inverse, &difference);
+        let inside = matrices::times_vector(&self.zonotope.generators, &coefficients);
+        ZonotopeGauge {
+            gauge: Some(coefficients.amax()),
+            residual_norm: (difference - inside).norm(),
+        }
+    }
+
+    /// The part of `point - centre` in the span of the generators.
+    #[must_use]
+    pub fn inside_span(&self, point: &DVector<f64>) -> DVector<f64> {
+        let difference = point - &self.zonotope.centre;
+        let coefficients = matrices::times_vector(&self.pseudo_inverse, &difference);
+        matrices::times_vector(&self.zonotope.generators, &coefficients)
+    }
+
+    /// Dimensions of the span of the generators.
+    #[must_use]
+    pub fn rank(&self) -> usize {
+        self.rank
+    }
+
+    /// Norm of the half widths of the box around the set.
+    #[must_use]
+    pub fn size(&self) -> f64 {
+        self.size
+    }
+}
+
 impl Zonotope {
     /// Centre n, generators n x p.
     ///
@@ -73,10 +123,10 @@ impl Zonotope {
     #[must_use]
     pub fn minkowski_sum(&self, other: &Self) -> Self {
         assert_eq!(self.dimension(), other.dimension(), "dimensions of the summands");
-        let mut generators = self.generators.clone().resize_horizontally(
-            self.generators.ncols() + other.generators.ncols(),
-            0.0,
-        );
+        let mut generators = self
+            .generators
+            .clone()
+            .resize_horizontally(self.generators.ncols() + other.generators.ncols(), 0.0);
         generators
             .columns_mut(self.generators.ncols(), other.generators.ncols())
             .copy_from(&other.generators);
@@ -92,23 +142,12 @@ impl Zonotope {
         )
     }
 
-    /// Measures `point - centre` by this set.
-    ///
-    /// Exact if the generators are linearly independent. Otherwise the least-norm coefficients
-    /// are taken, which is an upper bound on the gauge: it can call a point outside that is
-    /// inside, never the reverse.
+    /// Prepares for measuring many points by this set.
     #[must_use]
-    pub fn gauge(&self, point: &DVector<f64>) -> ZonotopeGauge {
-        let difference = point - &self.centre;
-        if self.is_point() {
-            return ZonotopeGauge { gauge: None, residual_norm: difference.norm() };
-        }
-        let coefficients = matrices::least_squares(&self.generators, &difference);
-        let inside_span = matrices::times_vector(&self.generators, &coefficients);
-        ZonotopeGauge {
-            gauge: Some(coefficients.amax()),
-            residual_norm: (difference - inside_span).norm(),
-        }
+    pub fn measure(&self) -> ZonotopeMeasure {
+        let (pseudo_inverse, rank) = matrices::pseudo_inverse(&self.generators);
+        let size = self.half_widths().norm();
+        ZonotopeMeasure { zonotope: self.clone(), pseudo_inverse, rank, size }
     }
 
     /// The 2^p sign combinations, as vertices (some may be interior).
@@ -153,8 +192,7 @@ impl ConvexSet for Zonotope {
     }
 
     fn support_function(&self, direction: &DVector<f64>) -> f64 {
-        let spread: f64 =
-            self.generators.column_iter().map(|g| direction.dot(&g).abs()).sum();
+        let spread: f64 = self.generators.column_iter().map(|g| direction.dot(&g).abs()).sum();
         direction.dot(&self.centre) + spread
     }
 }

@@ -1,0 +1,693 @@
+//! One decision: Algorithm 1 of both papers, and the baselines.
+
+use nalgebra::DVector;
+
+use super::{
+    Arrival, Artifact, Branch, Command, Diagnostics, MeasuredState, Measurement, Plan, PlanOutcome,
+    RealisedDisturbance, Scheme, Step, TerminalFallback, Trial, Tube, Verdict,
+    certify::{self, TOLERANCE, Verified},
+    search::{Found, Goal, Proof, Search},
+    stages::{Stages, Terminal},
+    state::{Flight, State},
+};
+use crate::{
+    budget::{Budget, Interruption},
+    control::{Claim, Failure, Fault, Infeasibility, StepError},
+    matrices::times_vector,
+    program::{Basis, zonotope_gauge},
+    units::{Force, Seconds},
+};
+
+/// A measurement must be this near to its step's time, as a share of the sample time.
+const EPOCH_TOLERANCE: f64 = 1e-3;
+/// Equality is normal in line 11 for W = {0} or without fuel weight: not a failure to decrease.
+const DECREASE_TOLERANCE: f64 = 1e-9;
+/// A gauge up to here is inside the assumed set: unit conversions round.
+const GAUGE_TOLERANCE: f64 = 1e-6;
+
+/// Decides the next command.
+///
+/// # Errors
+/// [`StepError`].
+pub(super) fn step(
+    artifact: &Artifact,
+    state: &State,
+    measurement: &Measurement,
+    budget: Budget<'_>,
+) -> Result<Step, StepError> {
+    let problem = &artifact.problem;
+    let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
+    if !state.fits(n, m, problem.steps_max, problem.horizon_max) {
+        return Err(StepError::State("it was not made by this controller".into()));
+    }
+    let measured = scaled_state(artifact, state.step, measurement)?;
+    let Some(flight) = &state.flight else {
+        return first_step(artifact, &measured, budget);
+    };
+    let disturbance = realised_disturbance(artifact, flight, &measured);
+    if flight.horizon == 1 {
+        return Ok(arrive(artifact, state, flight, &measured, disturbance));
+    }
+    let context = Context { artifact, step: state.step, flight, measured: &measured, disturbance };
+    match problem.scheme {
+        Scheme::TubeOptimalControl => context.tube_feedback(budget),
+        Scheme::AdaptiveTerminal | Scheme::FixedTerminal | Scheme::Nominal => {
+            context.receding_horizon(budget)
+        }
+    }
+}
+
+/// The plan from the mission's start.
+///
+/// # Errors
+/// [`StepError`].
+pub(super) fn plan(
+    artifact: &Artifact,
+    initial: &Measurement,
+    budget: Budget<'_>,
+) -> Result<PlanOutcome, StepError> {
+    let measured = scaled_state(artifact, 0, initial)?;
+    let mut search = start_search(artifact, &measured, budget);
+    let (verified, found) = match solve_first(&mut search)? {
+        Ok(solved) => solved,
+        Err(infeasible) => return Ok(PlanOutcome::Infeasible(infeasible)),
+    };
+    let commands = (0..found.horizon)
+        .map(|k| {
+            let input = verified.trajectory.inputs.row(k).transpose();
+            command(artifact, k, input, k + 1 == found.horizon)
+        })
+        .collect();
+    let tube = (artifact.problem.scheme == Scheme::TubeOptimalControl).then(|| Tube {
+        half_widths: artifact.tube.half_widths(found.horizon, artifact.tables.states()),
+        final_generators: artifact.tube.sum(0..found.horizon).generators().clone(),
+    });
+    let flight = first_flight(&measured, &found, &verified);
+    let trials = search.restart();
+    let diagnostics = diagnostics(artifact, &search, &flight, Branch::TerminalPoint, trials);
+    Ok(PlanOutcome::Plan(Plan {
+        commands,
+        trajectory: verified.trajectory,
+        tube,
+        certificate: verified.certificate,
+        diagnostics,
+    }))
+}
+
+fn start_search<'a, 'b>(
+    artifact: &'a Artifact,
+    measured: &DVector<f64>,
+    budget: Budget<'b>,
+) -> Search<'a, 'b> {
+    Search::new(Stages::new(artifact, 0, measured.as_slice()), None, budget)
+}
+
+/// P_0, verified.
+fn solve_first(
+    search: &mut Search<'_, '_>,
+) -> Result<Result<(Verified, Found), Infeasibility>, StepError> {
+    if let Some(infeasible) = certify::initial_state_fault(search) {
+        return Ok(Err(infeasible));
+    }
+    let limit = search.stages.horizon_limit();
+    let guess = search.stages.artifact.problem.horizon_guess;
+    let guess = guess.unwrap_or_else(|| search.stages.guess());
+    let found = match search.run(&Goal::Own, guess, limit) {
+        Ok(Some(found)) => found,
+        Ok(None) => return Ok(Err(certify::name_infeasibility(search, limit))),
+        Err(failure) => rescued_incumbent(search, failure, f64::INFINITY)?,
+    };
+    let verified = certify::verify_found(search, &found);
+    if verified.certificate.passed {
+        Ok(Ok((verified, found)))
+    } else {
+        Err(uncertified(&verified).into())
+    }
+}
+
+fn uncertified(verified: &Verified) -> Failure {
+    Failure::Numerical(format!(
+        "an answer did not pass its certificate: {:?}",
+        verified.certificate
+    ))
+}
+
+/// When time runs out, the best certified answer so far is still an answer.
+fn rescued_incumbent(
+    search: &mut Search<'_, '_>,
+    failure: Failure,
+    cost_max: f64,
+) -> Result<Found, Failure> {
+    if failure == Failure::Interrupted(Interruption::Cancelled) {
+        return Err(failure);
+    }
+    match search.incumbent.take() {
+        Some(found) if found.cost <= cost_max => Ok(Found { proof: Proof::None, ..found }),
+        _ => Err(failure),
+    }
+}
+
+fn first_step(
+    artifact: &Artifact,
+    measured: &DVector<f64>,
+    budget: Budget<'_>,
+) -> Result<Step, StepError> {
+    let mut search = start_search(artifact, measured, budget);
+    match solve_first(&mut search)? {
+        Err(infeasible) => {
+            let trials = search.restart();
+            Ok(infeasible_step(artifact, &search, &State::START, infeasible, None, trials))
+        }
+        Ok((verified, found)) => {
+            let flight = first_flight(measured, &found, &verified);
+            let branch = if artifact.problem.scheme == Scheme::TubeOptimalControl {
+                Branch::TubeFeedback
+            } else if artifact.problem.scheme == Scheme::FixedTerminal {
+                Branch::TerminalSet
+            } else {
+                Branch::TerminalPoint
+            };
+            let trials = search.restart();
+            let diagnostics = diagnostics(artifact, &search, &flight, branch, trials);
+            Ok(commanded(artifact, 0, flight, verified, None, diagnostics))
+        }
+    }
+}
+
+fn first_flight(measured: &DVector<f64>, found: &Found, verified: &Verified) -> Flight {
+    Flight {
+        previous_state: measured.clone(),
+        previous_input: verified.trajectory.inputs.row(0).transpose(),
+        cost: found.cost,
+        horizon: found.horizon,
+        adapted_step: 0,
+        adapted_horizon: found.horizon,
+        centre: found.terminal.centre.clone(),
+        powers: Vec::new(),
+        plan_step: 0,
+        plan_initial: measured.as_slice().to_vec(),
+        plan_inputs: found.solution.inputs.clone(),
+        basis: found.solution.basis.clone(),
+    }
+}
+
+/// A step after the first.
+struct Context<'a> {
+    artifact: &'a Artifact,
+    step: usize,
+    flight: &'a Flight,
+    measured: &'a DVector<f64>,
+    disturbance: RealisedDisturbance,
+}
+
+/// What a receding-horizon step settled on.
+struct Settled {
+    found: Found,
+    branch: Branch,
+    /// J and N of the problem with the terminal point.
+    point: Option<(f64, usize)>,
+    powers: Vec<usize>,
+}
+
+impl Context<'_> {
+    fn receding_horizon(self, budget: Budget<'_>) -> Result<Step, StepError> {
+        let stages = Stages::new(self.artifact, self.step, self.measured.as_slice());
+        let mut search = Search::new(stages, Some(self.flight.basis.shifted()), budget);
+        let mut trials = Vec::new();
+        let settled = match self.settle(&mut search, &mut trials) {
+            Ok(settled) => settled,
+            Err(Failure::Interrupted(Interruption::Cancelled)) => {
+                return Err(Failure::Interrupted(Interruption::Cancelled).into());
+            }
+            Err(failure) => return self.previous_plan_tail(&mut search, trials, failure),
+        };
+        trials.append(&mut search.restart());
+        let Some(settled) = settled else {
+            let limit = search.stages.horizon_limit();
+            let mut infeasible = certify::name_infeasibility(&mut search, limit);
+            if self.disturbance.outside_assumed_set {
+                infeasible.reason.push_str("; the last disturbance left the assumed set");
+            }
+            let state = State { step: self.step, flight: Some(self.flight.clone()) };
+            let disturbance = Some(self.disturbance);
+            return Ok(infeasible_step(
+                self.artifact,
+                &search,
+                &state,
+                infeasible,
+                disturbance,
+                trials,
+            ));
+        };
+        let verified = certify::verify_found(&search, &settled.found);
+        if !verified.certificate.passed {
+            let failure = uncertified(&verified);
+            return self.previous_plan_tail(&mut search, trials, failure);
+        }
+        let flight = self.next_flight(&settled, &verified);
+        let mut diagnostics = diagnostics(self.artifact, &search, &flight, settled.branch, trials);
+        diagnostics.point = settled.point;
+        let disturbance = Some(self.disturbance);
+        Ok(commanded(self.artifact, self.step, flight, verified, disturbance, diagnostics))
+    }
+
+    /// Lines 10 to 20 of Algorithm 1; for the baselines line 10 only. `None`: infeasible.
+    fn settle(
+        &self,
+        search: &mut Search<'_, '_>,
+        trials: &mut Vec<Trial>,
+    ) -> Result<Option<Settled>, Failure> {
+        let flight = self.flight;
+        let limit = search.stages.horizon_limit();
+        let adaptive = self.artifact.is_adaptive();
+        let cost_max = if adaptive {
+            flight.cost - self.artifact.decrease.lambda_bar
+                + DECREASE_TOLERANCE * (1.0 + flight.cost.abs())
+        } else {
+            f64::INFINITY
+        };
+        let found = match search.run(&Goal::Own, flight.horizon - 1, limit) {
+            Ok(found) => found,
+            Err(failure) => Some(rescued_incumbent(search, failure, cost_max)?),
+        };
+        let point = found.as_ref().map(|found| (found.cost, found.horizon));
+        if let Some(found) = found.filter(|found| found.cost <= cost_max) {
+            let own_set = self.artifact.problem.scheme == Scheme::FixedTerminal;
+            let branch = if own_set { Branch::TerminalSet } else { Branch::TerminalPoint };
+            return Ok(Some(Settled { found, branch, point, powers: Vec::new() }));
+        }
+        if !adaptive {
+            return Ok(None);
+        }
+        trials.append(&mut search.restart());
+        let mut powers = flight.powers.clone();
+        powers.push(flight.horizon - 1);
+        let horizon = flight.horizon - 1;
+        let found = match self.artifact.problem.fallback {
+            TerminalFallback::PreviousHorizon => {
+                let centre = flight.centre.clone();
+                search.fixed(&Goal::GrownFixed { centre, powers: powers.clone() }, horizon)?
+            }
+            TerminalFallback::FreeHorizon => {
+                let goal = Goal::GrownReference { powers: powers.clone() };
+                match search.run(&goal, horizon, horizon.min(limit)) {
+                    Ok(found) => found,
+                    Err(failure) => Some(rescued_incumbent(search, failure, f64::INFINITY)?),
+                }
+            }
+        };
+        Ok(found.map(|found| Settled { found, branch: Branch::TerminalSet, point, powers }))
+    }
+
+    fn next_flight(&self, settled: &Settled, verified: &Verified) -> Flight {
+        let found = &settled.found;
+        let adapted = settled.powers.is_empty();
+        Flight {
+            previous_state: self.measured.clone(),
+            previous_input: verified.trajectory.inputs.row(0).transpose(),
+            cost: found.cost,
+            horizon: found.horizon,
+            adapted_step: if adapted { self.step } else { self.flight.adapted_step },
+            adapted_horizon: if adapted { found.horizon } else { self.flight.adapted_horizon },
+            centre: found.terminal.centre.clone(),
+            powers: settled.powers.clone(),
+            plan_step: self.step,
+            plan_initial: self.measured.as_slice().to_vec(),
+            plan_inputs: found.solution.inputs.clone(),
+            basis: found.solution.basis.clone(),
+        }
+    }
+
+    /// The candidate of the recursive-feasibility proof [Quartullo2025a, eq. A5]: the previous
+    /// plan without its first input, corrected by v(j) + K A_K^j w. Feasible without solving
+    /// anything, as long as w is in W; verified all the same.
+    fn previous_plan_tail(
+        self,
+        search: &mut Search<'_, '_>,
+        mut trials: Vec<Trial>,
+        failure: Failure,
+    ) -> Result<Step, StepError> {
+        trials.append(&mut search.restart());
+        let artifact = self.artifact;
+        if self.disturbance.outside_assumed_set || !artifact.is_tightened() {
+            return Err(failure.into());
+        }
+        let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
+        let horizon = self.flight.horizon - 1;
+        let nominal = nominal_states(artifact, &self.flight.plan_initial, &self.flight.plan_inputs);
+        let mut inputs = Vec::with_capacity(horizon * m);
+        let mut error = self.disturbance.components.clone();
+        for j in 0..horizon {
+            let correction = times_vector(&artifact.gain, &error);
+            let planned = &self.flight.plan_inputs[(j + 1) * m..][..m];
+            inputs.extend(planned.iter().zip(correction.iter()).map(|(v, c)| v + c));
+            error = times_vector(&artifact.closed_loop, &error);
+        }
+        let end = &nominal[(horizon + 1) * n..];
+        let centre: Vec<f64> = end.iter().zip(error.iter()).map(|(z, e)| z + e).collect();
+        let terminal = Terminal { centre, generators: Vec::new(), constrain_last: false };
+        search.stages.extend_to(horizon);
+        let program = search.stages.program(horizon, &terminal);
+        let claim = Claim::PreviousPlanTail;
+        let verified = certify::verify_inputs(search, &program, &inputs, &[], claim, None);
+        if !verified.certificate.passed {
+            return Err(failure.into());
+        }
+        let mut powers = self.flight.powers.clone();
+        if artifact.is_adaptive() {
+            powers.push(horizon);
+        }
+        let flight = Flight {
+            previous_state: self.measured.clone(),
+            previous_input: verified.trajectory.inputs.row(0).transpose(),
+            cost: verified.certificate.cost,
+            horizon,
+            powers,
+            plan_step: self.step,
+            plan_initial: self.measured.as_slice().to_vec(),
+            plan_inputs: inputs,
+            basis: Basis::default(),
+            ..self.flight.clone()
+        };
+        let branch = Branch::PreviousPlanTail;
+        let diagnostics = diagnostics(artifact, search, &flight, branch, trials);
+        let disturbance = Some(self.disturbance);
+        Ok(commanded(artifact, self.step, flight, verified, disturbance, diagnostics))
+    }
+
+    /// u = v + K (x - z) around the plan of step 0. [Quartullo2025a, eq. 16]
+    fn tube_feedback(self, budget: Budget<'_>) -> Result<Step, StepError> {
+        let artifact = self.artifact;
+        let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
+        let plan = &self.flight.plan_inputs;
+        let nominal = nominal_states(artifact, &self.flight.plan_initial, plan);
+        let since = self.step - self.flight.plan_step;
+        let z = DVector::from_column_slice(&nominal[since * n..][..n]);
+        let v = DVector::from_column_slice(&plan[since * m..][..m]);
+        let input = v + times_vector(&artifact.gain, &(self.measured - z));
+        let start = Stages::new(artifact, self.flight.plan_step, &self.flight.plan_initial);
+        let mut search = Search::new(start, None, budget);
+        let horizon = plan.len() / m;
+        search.stages.extend_to(horizon);
+        let centre = self.flight.centre.clone();
+        let terminal = Terminal { centre, generators: Vec::new(), constrain_last: false };
+        let program = search.stages.program(horizon, &terminal);
+        let claim = Claim::FixedHorizon;
+        let bound = Some(self.flight.cost);
+        let mut verified = certify::verify_inputs(&search, &program, plan, &[], claim, bound);
+        if let Some(excess) = artifact.input_excess(&input) {
+            let infeasible = Infeasibility {
+                reason: format!(
+                    "the tube feedback exceeds the input bounds by {excess:.3e}: the state has \
+                     left the tube around the plan"
+                ),
+                horizon: self.flight.horizon - 1,
+                rows: Vec::new(),
+                relaxations: Vec::new(),
+                all_horizons_proved: false,
+            };
+            let state = State { step: self.step, flight: Some(self.flight.clone()) };
+            let disturbance = Some(self.disturbance);
+            let none = Vec::new();
+            return Ok(infeasible_step(artifact, &search, &state, infeasible, disturbance, none));
+        }
+        if !verified.certificate.passed {
+            return Err(uncertified(&verified).into());
+        }
+        // What is ahead of the present step.
+        let left = horizon - since;
+        let whole = &verified.trajectory;
+        verified.trajectory = super::Trajectory {
+            states: whole.states.rows(since, left + 1).into_owned(),
+            inputs: whole.inputs.rows(since, left).into_owned(),
+        };
+        let flight = Flight {
+            previous_state: self.measured.clone(),
+            previous_input: input.clone(),
+            horizon: left,
+            ..self.flight.clone()
+        };
+        let branch = Branch::TubeFeedback;
+        let diagnostics = diagnostics(artifact, &search, &flight, branch, Vec::new());
+        let disturbance = Some(self.disturbance);
+        Ok(commanded(artifact, self.step, flight, verified, disturbance, diagnostics))
+    }
+}
+
+fn nominal_states(artifact: &Artifact, initial: &[f64], inputs: &[f64]) -> Vec<f64> {
+    let horizon = inputs.len() / artifact.tables.inputs();
+    let mut states = vec![0.0; (horizon + 1) * initial.len()];
+    states[..initial.len()].copy_from_slice(initial);
+    artifact.tables.roll_forward(inputs, &mut states);
+    states
+}
+
+fn commanded(
+    artifact: &Artifact,
+    step: usize,
+    flight: Flight,
+    verified: Verified,
+    disturbance: Option<RealisedDisturbance>,
+    diagnostics: Diagnostics,
+) -> Step {
+    let last = flight.horizon == 1;
+    Step {
+        index: step,
+        verdict: Verdict::Command(command(artifact, step, flight.previous_input.clone(), last)),
+        next: State { step: step + 1, flight: Some(flight) },
+        trajectory: Some(verified.trajectory),
+        certificate: Some(verified.certificate),
+        disturbance,
+        diagnostics,
+    }
+}
+
+fn command(artifact: &Artifact, step: usize, input: DVector<f64>, last: bool) -> Command {
+    let accelerations = artifact.model.scaling.map(|scaling| {
+        let unit = scaling.acceleration_unit_m_s2;
+        [0, 1, 2].map(|i| crate::units::Acceleration::from_m_s2(input[i] * unit))
+    });
+    let mass = match &artifact.problem.plant {
+        super::Plant::Hill(plant) => plant.mass,
+        super::Plant::Linear(_) => None,
+    };
+    let force = |mass: crate::units::Mass| -> Option<[Force; 3]> {
+        accelerations.map(|a| a.map(|a| mass * a))
+    };
+    Command {
+        elapsed: Seconds::from_seconds(artifact.elapsed_s(step)),
+        duration: artifact.model.sample_time,
+        input,
+        acceleration: accelerations,
+        force: mass.and_then(force),
+        last,
+    }
+}
+
+fn infeasible_step(
+    artifact: &Artifact,
+    search: &Search<'_, '_>,
+    state: &State,
+    infeasible: Infeasibility,
+    disturbance: Option<RealisedDisturbance>,
+    trials: Vec<Trial>,
+) -> Step {
+    let centre = DVector::zeros(artifact.tables.states());
+    Step {
+        index: state.step,
+        verdict: Verdict::Infeasible(infeasible),
+        next: state.clone(),
+        trajectory: None,
+        certificate: None,
+        disturbance,
+        diagnostics: Diagnostics {
+            branch: Branch::None,
+            cost: 0.0,
+            horizon: 0,
+            point: None,
+            adapted_step: state.flight.as_ref().map_or(0, |flight| flight.adapted_step),
+            adapted_horizon: state.flight.as_ref().map_or(0, |flight| flight.adapted_horizon),
+            terminal_set_powers: Vec::new(),
+            terminal_centre: centre,
+            trials,
+            simplex_pivots: search.pivots,
+            general_solver_calls: search.general_solver_calls,
+            lambda: artifact.decrease.lambda_bar,
+        },
+    }
+}
+
+fn diagnostics(
+    artifact: &Artifact,
+    search: &Search<'_, '_>,
+    flight: &Flight,
+    branch: Branch,
+    trials: Vec<Trial>,
+) -> Diagnostics {
+    Diagnostics {
+        branch,
+        cost: flight.cost,
+        horizon: flight.horizon,
+        point: (branch == Branch::TerminalPoint).then_some((flight.cost, flight.horizon)),
+        adapted_step: flight.adapted_step,
+        adapted_horizon: flight.adapted_horizon,
+        terminal_set_powers: flight.powers.clone(),
+        terminal_centre: DVector::from_column_slice(&flight.centre),
+        trials,
+        simplex_pivots: search.pivots,
+        general_solver_calls: search.general_solver_calls,
+        lambda: artifact.decrease.lambda_bar,
+    }
+}
+
+/// The step after the last command.
+fn arrive(
+    artifact: &Artifact,
+    state: &State,
+    flight: &Flight,
+    measured: &DVector<f64>,
+    disturbance: RealisedDisturbance,
+) -> Step {
+    let step = state.step;
+    let zero = DVector::zeros(measured.len());
+    let reference = artifact.model.reference(step).unwrap_or(&zero);
+    let deviation = measured - reference;
+    let distance =
+        artifact.model.scaling.map(|scaling| deviation.rows(0, 3).norm() * scaling.position_unit_m);
+    let arrival = Arrival {
+        completion_steps: step,
+        distance_m: distance,
+        deviation_norm: deviation.norm(),
+        inside_guaranteed_set: inside_final_set(artifact, flight, measured),
+    };
+    Step {
+        index: step,
+        verdict: Verdict::Arrived(arrival),
+        next: state.clone(),
+        trajectory: None,
+        certificate: None,
+        disturbance: Some(disturbance),
+        diagnostics: Diagnostics {
+            branch: Branch::None,
+            cost: 0.0,
+            horizon: 0,
+            point: None,
+            adapted_step: flight.adapted_step,
+            adapted_horizon: flight.adapted_horizon,
+            terminal_set_powers: flight.powers.clone(),
+            terminal_centre: DVector::from_column_slice(&flight.centre),
+            trials: Vec::new(),
+            simplex_pivots: 0,
+            general_solver_calls: 0,
+            lambda: artifact.decrease.lambda_bar,
+        },
+    }
+}
+
+/// Is x in {terminal point} + S(N_q)? [Quartullo2025a, Proposition 1; Quartullo2025b, Theorem 2]
+/// For the fixed terminal set S(inf) takes the place of S(N_q).
+fn inside_final_set(artifact: &Artifact, flight: &Flight, measured: &DVector<f64>) -> bool {
+    let deviation = measured - DVector::from_column_slice(&flight.centre);
+    let set = match artifact.problem.scheme {
+        Scheme::FixedTerminal => artifact.tube.sum(0..artifact.tube.terms()),
+        Scheme::Nominal => return deviation.amax() <= TOLERANCE,
+        Scheme::AdaptiveTerminal | Scheme::TubeOptimalControl => {
+            artifact.tube.sum(0..flight.adapted_horizon)
+        }
+    };
+    if set.is_point() {
+        return deviation.amax() <= TOLERANCE;
+    }
+    zonotope_gauge(set.generators(), &deviation).is_some_and(|gauge| gauge <= 1.0 + GAUGE_TOLERANCE)
+}
+
+fn realised_disturbance(
+    artifact: &Artifact,
+    flight: &Flight,
+    measured: &DVector<f64>,
+) -> RealisedDisturbance {
+    let predicted = times_vector(&artifact.model.a, &flight.previous_state)
+        + times_vector(&artifact.model.b, &flight.previous_input);
+    let components = measured - predicted;
+    let measure = artifact.disturbance_measure.gauge(&components);
+    // The upper bound from least-norm coefficients is sharp unless the generators are dependent.
+    let gauge = match measure.gauge {
+        Some(bound) if bound > 1.0 && artifact.has_dependent_generators() => {
+            let generators = artifact.model.disturbance.generators();
+            let inside_span = artifact.disturbance_measure.inside_span(&components);
+            Some(zonotope_gauge(generators, &inside_span).unwrap_or(bound))
+        }
+        gauge => gauge,
+    };
+    let residual_max = TOLERANCE.max(GAUGE_TOLERANCE * artifact.disturbance_measure.size());
+    let outside = gauge.is_some_and(|gauge| gauge > 1.0 + GAUGE_TOLERANCE)
+        || measure.residual_norm > residual_max;
+    RealisedDisturbance {
+        components,
+        gauge,
+        residual_norm: measure.residual_norm,
+        outside_assumed_set: outside,
+    }
+}
+
+/// The measured state in scaled units, after every check.
+fn scaled_state(
+    artifact: &Artifact,
+    step: usize,
+    measurement: &Measurement,
+) -> Result<DVector<f64>, StepError> {
+    let mut faults = Vec::new();
+    if let (Some(elapsed), Some(sample_time)) = (measurement.elapsed, artifact.model.sample_time) {
+        let expected = artifact.elapsed_s(step);
+        let late = (elapsed.seconds() - expected).abs();
+        if !(late <= EPOCH_TOLERANCE * sample_time.seconds()) {
+            faults.push(Fault::new(
+                "elapsed_s",
+                format!("{expected} s, the time of step {step}"),
+                format!("{} s", elapsed.seconds()),
+            ));
+        }
+    }
+    let n = artifact.tables.states();
+    let state = match (&measurement.state, artifact.model.scaling) {
+        (MeasuredState::Relative(state), Some(scaling)) => Some(scaling.scaled(state)),
+        (MeasuredState::Linear(state), None) if state.len() == n => Some(state.clone()),
+        (MeasuredState::Linear(state), None) => {
+            let got = format!("{} values", state.len());
+            faults.push(Fault::new("linear.components", format!("{n} values"), got));
+            None
+        }
+        (MeasuredState::Linear(_), Some(_)) => {
+            faults.push(Fault::new(
+                "linear",
+                "a relative state: the plant is a spacecraft",
+                "a linear state",
+            ));
+            None
+        }
+        (MeasuredState::Relative(_), None) => {
+            faults.push(Fault::new(
+                "relative",
+                "a linear state: the plant is a general one",
+                "a relative state",
+            ));
+            None
+        }
+    };
+    if let Some(state) = &state
+        && !state.iter().all(|x| x.is_finite())
+    {
+        faults.push(Fault::new("", "finite numbers", "a number that is not finite when scaled"));
+    }
+    match state {
+        Some(state) if faults.is_empty() => Ok(state),
+        _ => Err(StepError::Measurement(faults)),
+    }
+}
+
+impl Artifact {
+    /// Time of step `step` since the mission's start; 0 for a plant without a sample time.
+    fn elapsed_s(&self, step: usize) -> f64 {
+        self.model.sample_time.map_or(0.0, |time| super::stages::as_f64(step) * time.seconds())
+    }
+}

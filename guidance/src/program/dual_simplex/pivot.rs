@@ -1,0 +1,257 @@
+//! Carrying out a dual step.
+
+use super::{
+    ActiveRow, BasicColumn, Basis, DualSimplex, HorizonProgram, INACTIVE, Leaving, Multiplier,
+    Place, Solution, Status,
+    ratio::{Candidate, Event},
+};
+
+impl DualSimplex {
+    /// Moves along the direction to `step` and exchanges what leaves for what enters.
+    pub(super) fn pivot(
+        &mut self,
+        program: &HorizonProgram<'_>,
+        leaving: Leaving,
+        step: Candidate,
+    ) {
+        self.move_dual(step.length);
+        for i in 0..self.passed.len() {
+            if let Event::Column { index, segment, up } = self.passed[i].event {
+                self.rest(index, if up { segment + 1 } else { segment });
+            }
+        }
+        let own_segment = self.passed.iter().rev().find_map(|passed| match passed.event {
+            Event::NextSegment { segment } => Some(segment),
+            _ => None,
+        });
+        match leaving {
+            Leaving::Row { index, residual } => self.activate(program, index, residual, step),
+            Leaving::Column { position, at_top, .. } => {
+                // Beyond its next slope the column rests one point further.
+                if let (Some(segment), Place::Basic { .. }) =
+                    (own_segment, self.place[self.basic[position]])
+                {
+                    self.place[self.basic[position]] = Place::Basic { segment };
+                }
+                self.release(position, at_top, step);
+            }
+        }
+    }
+
+    fn move_dual(&mut self, length: f64) {
+        for (row, change) in self.active.iter_mut().zip(&self.multiplier_step) {
+            row.multiplier += length * change;
+        }
+        for (value, change) in self.gradient.iter_mut().zip(&self.gradient_step) {
+            *value += length * change;
+        }
+    }
+
+    /// A violated row becomes active.
+    fn activate(
+        &mut self,
+        program: &HorizonProgram<'_>,
+        index: usize,
+        residual: f64,
+        step: Candidate,
+    ) {
+        let sign = residual.signum();
+        let (lower, upper) = self.multiplier_range(program, index);
+        let from = if self.is_tracking(index) {
+            if self.at_upper[index - self.layout.tracking] { upper } else { lower }
+        } else {
+            0.0
+        };
+        let multiplier = from + sign * step.length;
+        match step.event {
+            Event::Flip => self.at_upper[index - self.layout.tracking] = residual > 0.0,
+            Event::Column { index: column, segment, .. } => {
+                let entering = self.enter(column, segment);
+                let pivot = sign * self.gradient_step[column];
+                self.kernel.border(&entering, &self.rho, pivot);
+                self.basic.push(column);
+                self.position[index] = u32::try_from(self.active.len()).unwrap_or(INACTIVE);
+                self.append_row(program, index, multiplier);
+            }
+            Event::Row { position, at_upper } => {
+                self.kernel.replace_row(position, &self.rho);
+                self.rest_row(position, at_upper);
+                self.position[index] = u32::try_from(position).unwrap_or(INACTIVE);
+                let count = self.columns.len();
+                let right = self.right_side(program, index);
+                self.coefficients[position * count..][..count]
+                    .copy_from_slice(&self.leaving_coefficients);
+                self.active[position] = ActiveRow { index, multiplier, right };
+            }
+            Event::NextSegment { .. } => unreachable!("only a leaving column has a next segment"),
+        }
+    }
+
+    /// A basic column comes to rest at the end of its segment.
+    fn release(&mut self, position: usize, at_top: bool, step: Candidate) {
+        let column = self.basic[position];
+        let Place::Basic { segment } = self.place[column] else { return };
+        let point = if at_top { segment + 1 } else { segment };
+        match step.event {
+            Event::NextSegment { segment } => self.place[column] = Place::Basic { segment },
+            Event::Column { index, segment, .. } => {
+                let entering = self.enter(index, segment);
+                self.kernel.replace_column(position, &entering);
+                self.basic[position] = index;
+                self.come_to_rest(column, point);
+            }
+            Event::Row { position: row, at_upper } => {
+                self.come_to_rest(column, point);
+                self.rest_row(row, at_upper);
+                self.drop_pair(position, row);
+            }
+            Event::Flip => unreachable!("only a leaving row flips"),
+        }
+    }
+
+    /// Makes a resting column basic; returns its column of the kernel's new system, M^-1 m.
+    fn enter(&mut self, column: usize, segment: u8) -> Vec<f64> {
+        let count = self.columns.len();
+        let value = self.values[column];
+        let line: Vec<f64> =
+            (0..self.active.len()).map(|i| self.coefficients[i * count + column]).collect();
+        for (row, coefficient) in self.active.iter_mut().zip(&line) {
+            row.right += coefficient * value;
+        }
+        self.place[column] = Place::Basic { segment };
+        let mut entering = std::mem::take(&mut self.entering);
+        self.kernel.solve(&line, &mut entering);
+        entering
+    }
+
+    /// A basic column comes to rest at `point`.
+    fn come_to_rest(&mut self, column: usize, point: u8) {
+        self.place[column] = Place::At(point);
+        self.values[column] = 0.0;
+        self.rest(column, point);
+    }
+
+    /// A column whose contribution is on the right sides moves to `point`.
+    fn rest(&mut self, column: usize, point: u8) {
+        let value = self.columns[column].points[point as usize];
+        let change = value - self.values[column];
+        let count = self.columns.len();
+        for (i, row) in self.active.iter_mut().enumerate() {
+            row.right -= self.coefficients[i * count + column] * change;
+        }
+        self.place[column] = Place::At(point);
+        self.values[column] = value;
+    }
+
+    fn rest_row(&mut self, position: usize, at_upper: bool) {
+        let index = self.active[position].index;
+        self.position[index] = INACTIVE;
+        if self.is_tracking(index) {
+            self.at_upper[index - self.layout.tracking] = at_upper;
+        }
+    }
+
+    fn append_row(&mut self, program: &HorizonProgram<'_>, index: usize, multiplier: f64) {
+        let right = self.right_side(program, index);
+        self.coefficients.extend_from_slice(&self.leaving_coefficients);
+        self.active.push(ActiveRow { index, multiplier, right });
+    }
+
+    /// Right side of the row in `leaving_coefficients`.
+    fn right_side(&self, program: &HorizonProgram<'_>, index: usize) -> f64 {
+        let resting = self.resting_contribution(&self.leaving_coefficients);
+        -self.free_residual(program, index) - resting
+    }
+
+    /// Drops a basic column and an active row from the lists and the kernel.
+    pub(super) fn drop_pair(&mut self, column: usize, row: usize) {
+        self.kernel.shrink(column, row);
+        self.position[self.active[row].index] = INACTIVE;
+        self.basic.swap_remove(column);
+        self.active.swap_remove(row);
+        let count = self.columns.len();
+        let last = self.active.len();
+        if row < last {
+            self.coefficients.copy_within(last * count..(last + 1) * count, row * count);
+            self.position[self.active[row].index] = u32::try_from(row).unwrap_or(INACTIVE);
+        }
+        self.coefficients.truncate(last * count);
+    }
+
+    /// The direction as a Farkas ray.
+    pub(super) fn ray(&self, program: &HorizonProgram<'_>, leaving: Leaving) -> Vec<Multiplier> {
+        let active = self.active.iter().zip(&self.multiplier_step).map(|(row, step)| Multiplier {
+            row: self.row_id(program, row.index),
+            value: step * self.scale[row.index],
+        });
+        let own = match leaving {
+            Leaving::Row { index, residual } => Some(Multiplier {
+                row: self.row_id(program, index),
+                value: residual.signum() * self.scale[index],
+            }),
+            Leaving::Column { .. } => None,
+        };
+        active.chain(own).collect()
+    }
+
+    /// Nonzero multipliers of all rows, in the rows' own scale.
+    pub(super) fn multipliers(&self, program: &HorizonProgram<'_>) -> Vec<Multiplier> {
+        let active = self.active.iter().map(|row| Multiplier {
+            row: self.row_id(program, row.index),
+            value: row.multiplier * self.scale[row.index],
+        });
+        let tracking = self.layout.tracking..self.layout.input;
+        let resting = tracking.filter(|&index| self.position[index] == INACTIVE).map(|index| {
+            let row = self.row_id(program, index);
+            Multiplier { row, value: self.resting_multiplier(program, index) }
+        });
+        active.chain(resting).collect()
+    }
+
+    pub(super) fn solution(
+        &self,
+        program: &HorizonProgram<'_>,
+        status: Status,
+        objective: f64,
+        multipliers: Vec<Multiplier>,
+        iterations: usize,
+    ) -> Solution {
+        let inputs = program.horizon * program.inputs();
+        let clamped = |range: std::ops::Range<usize>| -> Vec<f64> {
+            let columns = self.columns[range.clone()].iter().zip(&self.values[range]);
+            columns.map(|(c, v)| v.clamp(c.points[0], c.points[c.last() as usize])).collect()
+        };
+        let optimal = status == Status::Optimal;
+        Solution {
+            status,
+            objective,
+            inputs: if optimal { clamped(0..inputs) } else { Vec::new() },
+            terminal_coefficients: if optimal {
+                clamped(inputs..self.columns.len())
+            } else {
+                Vec::new()
+            },
+            multipliers,
+            basis: self.basis(program),
+            iterations,
+        }
+    }
+
+    fn basis(&self, program: &HorizonProgram<'_>) -> Basis {
+        let m = program.inputs();
+        let inputs = program.horizon * m;
+        let columns = self.basic.iter().filter_map(|&index| {
+            let Place::Basic { segment } = self.place[index] else { return None };
+            let (stage, index) = if index < inputs {
+                (index / m, index % m)
+            } else {
+                (program.horizon, index - inputs)
+            };
+            Some(BasicColumn { stage, index, segment: segment.into() })
+        });
+        Basis {
+            rows: self.active.iter().map(|row| self.row_id(program, row.index)).collect(),
+            columns: columns.collect(),
+        }
+    }
+}
