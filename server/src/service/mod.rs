@@ -22,7 +22,7 @@ pub(crate) use error::{Code, Error};
 pub(crate) use session::{Session, SessionAnswer};
 
 use crate::{
-    compute::{Compute, Timed},
+    compute::Compute,
     store::{ArtifactStore, Put},
     telemetry::{Metrics, OutcomeLabels},
     wire::{

@@ -22,14 +22,22 @@ const OUTSIDE: [&str; 14] = [
     "tokio",
 ];
 
+/// Functions whose last bit is the machine's business; `libm` has them in one version for all.
+const TRANSCENDENTAL: [&str; 18] = [
+    "acos", "asin", "atan", "atan2", "cbrt", "cos", "cosh", "exp", "exp2", "hypot", "ln", "log10",
+    "log2", "powf", "sin", "sin_cos", "sinh", "tan",
+];
+
 /// Everything `guidance` may depend on.
 const GUIDANCE_DEPENDENCIES: [&str; 6] =
     ["clarabel", "libm", "nalgebra", "rand", "rand_chacha", "thiserror"];
 
-/// `guidance` has no clock, file, socket, thread, environment, unseeded chance, serde or async.
+/// `guidance` has no clock, file, socket, thread, environment, unseeded chance, serde or async,
+/// and no function that the machine's own library would answer.
 pub fn purity(tree: &Tree) -> Vec<String> {
     let mut faults = Vec::new();
     for (path, text) in tree.below("guidance/src", "rs") {
+        faults.extend(machine_functions(path, text));
         match paths::used(path, text) {
             Err(fault) => faults.push(fault),
             Ok(used) => {
@@ -44,6 +52,20 @@ pub fn purity(tree: &Tree) -> Vec<String> {
         }
     }
     faults.extend(foreign_dependencies(tree));
+    faults
+}
+
+fn machine_functions(path: &str, text: &str) -> Vec<String> {
+    let mut faults = Vec::new();
+    for (line, content) in text.lines().enumerate() {
+        let code = content.split("//").next().unwrap_or_default();
+        for name in TRANSCENDENTAL {
+            if code.contains(&format!(".{name}(")) || code.contains(&format!("f64::{name}")) {
+                let line = line + 1;
+                faults.push(format!("{path}:{line}: {name} in pure code must be libm::{name}"));
+            }
+        }
+    }
     faults
 }
 

@@ -160,6 +160,7 @@ fn impure_mathematics_is_found() {
     let manifest = ("guidance/Cargo.toml", "[dependencies]\nlibm.workspace = true");
     let with = |text| [manifest, ("guidance/src/sets/mod.rs", text)];
     accepts(purity, &with("use std::fmt; #[cfg(test)] mod tests { use std::fs; }"));
+    accepts(purity, &with("fn f(x: f64) -> f64 { libm::tan(x).abs().sqrt() } // x.tan()"));
     for text in [
         "use std::time::Instant;",
         "use std::{fmt, fs};",
@@ -167,6 +168,8 @@ fn impure_mathematics_is_found() {
         "fn f() { println!(\"{:?}\", std::thread::current()); }",
         "use std::collections::{BTreeMap, HashMap};",
         "use serde::Serialize;",
+        "fn f(x: f64) -> f64 { x.tan() }",
+        "fn f(x: f64) -> f64 { Some(x).map_or(0.0, f64::exp) }",
     ] {
         finds(purity, &with(text), &["sets/mod.rs:1", "pure"]);
     }
