@@ -19,7 +19,7 @@ use hyper_util::{
 use tokio::{
     net::{TcpListener, TcpStream},
     sync::{Semaphore, watch},
-    task::JoinHandle,
+    task::{JoinHandle, JoinSet},
     time::timeout,
 };
 
@@ -133,6 +133,8 @@ impl Port {
     async fn serve(self, listener: TcpListener, mut draining: watch::Receiver<bool>) {
         let slots = Arc::new(Semaphore::new(self.config.connections_max));
         let graceful = GracefulShutdown::new();
+        // Dropped at the end, and with it whatever is still open.
+        let mut connections = JoinSet::new();
         loop {
             // If the node is dropped without a shutdown, its port closes all the same.
             let accepted = tokio::select! {
@@ -143,7 +145,8 @@ impl Port {
                 Ok((stream, _)) => match Arc::clone(&slots).try_acquire_owned() {
                     Ok(slot) => {
                         let connection = self.connection(stream, graceful.watcher());
-                        tokio::spawn(async move {
+                        while connections.try_join_next().is_some() {}
+                        connections.spawn(async move {
                             connection.await;
                             drop(slot);
                         });
@@ -175,7 +178,7 @@ impl Port {
         let builder = self.builder();
         let front = self.front.clone();
         let metrics = Arc::clone(&self.metrics);
-        let first_byte = self.config.receive_time_max;
+        let receive_time_max = self.config.receive_time_max;
         async move {
             metrics.connections.inc();
             let _open = Open(metrics);
@@ -183,11 +186,12 @@ impl Port {
             if let Err(fault) = stream.set_nodelay(true) {
                 tracing::debug!(%fault, "TCP_NODELAY");
             }
-            // A connection that never says anything is dropped before it costs a parser.
-            match timeout(first_byte, stream.readable()).await {
-                Ok(Ok(())) => {}
+            let builder = match timeout(receive_time_max, speaks_http2(&stream)).await {
+                Ok(Ok(true)) => builder.http2_only(),
+                Ok(Ok(false)) => builder.http1_only(),
+                // Gone, or silent for too long.
                 Ok(Err(_)) | Err(_) => return,
-            }
+            };
             let answer = hyper::service::service_fn(move |request: hyper::Request<_>| {
                 let front = front.clone();
                 async move { Ok::<_, Infallible>(front.answer(request.map(Body::new)).await) }
@@ -220,6 +224,28 @@ impl Port {
             .keep_alive_interval(PING_EVERY)
             .keep_alive_timeout(PING_ANSWERED_WITHIN);
         builder
+    }
+}
+
+/// Whether a connection begins with the preface of HTTP/2 (RFC 9113, sec. 3.4).
+///
+/// Looked at here and not by the HTTP library, because it would wait for a preface for ever.
+async fn speaks_http2(stream: &TcpStream) -> io::Result<bool> {
+    const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+    let mut begin = [0; PREFACE.len()];
+    loop {
+        let length = stream.peek(&mut begin).await?;
+        if length == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        if begin[..length] != PREFACE[..length] {
+            return Ok(false);
+        }
+        if length == PREFACE.len() {
+            return Ok(true);
+        }
+        // The rest of a preface that came in pieces; peeking again gives the same bytes at once.
+        tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
 

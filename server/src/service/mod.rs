@@ -251,7 +251,7 @@ impl Service {
     ) -> Result<Timed<DecidedStep>, Error> {
         let work = move |budget: Budget<'_>| -> Result<DecidedStep, Error> {
             let state = match state {
-                StateSource::Decoded(state) => state,
+                StateSource::Decoded(state) => *state,
                 StateSource::Envelope(bytes) => load_state(&artifact, &bytes)?,
             };
             let step = artifact.artifact.step(&state, &measurement, budget);

@@ -90,7 +90,7 @@ impl Session {
             .service
             .decide(
                 artifact,
-                StateSource::Decoded(state),
+                StateSource::Decoded(Box::new(state)),
                 measurement,
                 message.omit_prediction,
                 call,
@@ -107,5 +107,5 @@ pub(super) enum StateSource {
     /// As it travelled; empty at the start.
     Envelope(Bytes),
     /// Kept by a session.
-    Decoded(State),
+    Decoded(Box<State>),
 }
