@@ -178,11 +178,26 @@ pub fn linear_quadratic_regulator(
     Err(GainError::Riccati)
 }
 
-/// Largest modulus of an eigenvalue; `None` if the Schur decomposition does not converge.
+/// Largest modulus of an eigenvalue, by squaring: |A^(2^k)|^(1/2^k), rescaled at each squaring.
+///
+/// Unlike a Schur iteration this cannot fail on repeated eigenvalues, which pole placement makes
+/// on purpose. After 60 squarings the norm's own factor has vanished below rounding.
 #[must_use]
-pub fn spectral_radius(matrix: &DMatrix<f64>) -> Option<f64> {
-    let schur = nalgebra::Schur::try_new(matrix.clone(), f64::EPSILON, 10_000)?;
-    schur.complex_eigenvalues().iter().map(|z| libm::hypot(z.re, z.im)).reduce(f64::max)
+pub fn spectral_radius(matrix: &DMatrix<f64>) -> f64 {
+    let mut power = matrix.clone();
+    let mut logarithm = 0.0;
+    let mut weight = 1.0;
+    for _ in 0..60 {
+        let size = power.amax();
+        if size == 0.0 {
+            return 0.0;
+        }
+        logarithm += weight * libm::log(size);
+        power /= size;
+        power = product(&power, &power);
+        weight *= 0.5;
+    }
+    libm::exp(logarithm)
 }
 
 #[cfg(test)]
@@ -227,5 +242,17 @@ mod tests {
         let k = linear_quadratic_regulator(&a, &one, &one, &one).unwrap();
         let p = 2.0 + 5.0_f64.sqrt();
         assert!((k[(0, 0)] + 2.0 * p / (1.0 + p)).abs() < 1e-13);
+    }
+
+    #[test]
+    fn spectral_radius_of_known_matrices() {
+        let rotation = DMatrix::from_row_slice(2, 2, &[0.6, -0.3, 0.3, 0.6]);
+        assert!((spectral_radius(&rotation) - 0.45_f64.sqrt()).abs() < 1e-12);
+        let defective = DMatrix::from_row_slice(2, 2, &[0.9, 5.0, 0.0, 0.9]);
+        assert!((spectral_radius(&defective) - 0.9).abs() < 1e-12);
+        let nilpotent = DMatrix::from_row_slice(2, 2, &[0.0, 1.0, 0.0, 0.0]);
+        assert_eq!(spectral_radius(&nilpotent), 0.0);
+        let unstable = DMatrix::from_row_slice(2, 2, &[1.0, 0.0, 0.0, 1.5]);
+        assert!((spectral_radius(&unstable) - 1.5).abs() < 1e-12);
     }
 }

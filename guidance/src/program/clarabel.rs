@@ -285,18 +285,28 @@ impl SparseProgram {
     }
 
     fn solve(&self) -> Answer {
-        let (rows, columns) = (self.right.len(), self.layout.end);
-        let (i, j, v) = self.triplets.clone();
-        let matrix = CscMatrix::new_from_triplets(rows, columns, i, j, v);
-        let cones: [SupportedConeT<f64>; 2] =
-            [ZeroConeT(self.equalities), NonnegativeConeT(rows - self.equalities)];
-        let settings = DefaultSettings {
+        // Tight first; long horizons sometimes stop short of that but reach the defaults.
+        let tight = DefaultSettings {
             verbose: false,
             tol_gap_abs: 1e-10,
             tol_gap_rel: 1e-10,
             tol_feas: 1e-11,
             ..DefaultSettings::default()
         };
+        let usual = DefaultSettings { verbose: false, ..DefaultSettings::default() };
+        let first = self.solve_with(tight);
+        if first.status == SolverStatus::Solved || first.status == SolverStatus::PrimalInfeasible {
+            return first;
+        }
+        self.solve_with(usual)
+    }
+
+    fn solve_with(&self, settings: DefaultSettings<f64>) -> Answer {
+        let (rows, columns) = (self.right.len(), self.layout.end);
+        let (i, j, v) = self.triplets.clone();
+        let matrix = CscMatrix::new_from_triplets(rows, columns, i, j, v);
+        let cones: [SupportedConeT<f64>; 2] =
+            [ZeroConeT(self.equalities), NonnegativeConeT(rows - self.equalities)];
         let none = CscMatrix::zeros((columns, columns));
         match DefaultSolver::new(&none, &self.objective, &matrix, &self.right, &cones, settings) {
             Ok(mut solver) => {

@@ -1,3 +1,5 @@
 //! Golden cases, laws and closed loops of the mathematics, through its public interface.
 
+#![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
+
 mod golden;

@@ -128,10 +128,8 @@ impl Artifact {
         let not_schur = |what: String| {
             Fault::new("gain", "A + B K with all eigenvalues inside the unit circle", what)
         };
-        match radius {
-            Some(radius) if radius < 1.0 => {}
-            Some(radius) => return Err(not_schur(format!("largest modulus {radius}"))),
-            None => return Err(not_schur("eigenvalues that could not be computed".into())),
+        if !(radius < 1.0) {
+            return Err(not_schur(format!("largest modulus {radius}")));
         }
         let tube = Tube::new(&closed_loop, &gain, &model.disturbance)
             .map_err(|error| not_schur(error.to_string()))?;
@@ -143,7 +141,7 @@ impl Artifact {
             model,
             gain,
             closed_loop,
-            spectral_radius: radius.unwrap_or(f64::NAN),
+            spectral_radius: radius,
             tube,
             decrease,
             tables,

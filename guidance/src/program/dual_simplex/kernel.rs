@@ -122,14 +122,14 @@ impl Kernel {
 
     /// Inverts `matrix` (rows x columns, row by row) as far as it has rank, by complete pivoting.
     ///
-    /// Returns the kept (row, column) pairs of indices; the inverse is in that order.
+    /// A pivot below `tolerance` times the largest entry ends it. Returns the kept (row, column) pairs of indices; the inverse is in that order.
     pub(super) fn factor(
         &mut self,
         matrix: &[f64],
         rows: usize,
         columns: usize,
+        tolerance: f64,
     ) -> Vec<(usize, usize)> {
-        const RANK_TOLERANCE: f64 = 1e-9;
         self.clear();
         let mut kept: Vec<(usize, usize)> = Vec::with_capacity(rows.min(columns));
         let mut free_rows: Vec<usize> = (0..rows).collect();
@@ -139,7 +139,7 @@ impl Kernel {
         let largest = rest.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
         while let Some((i, j)) = largest_entry(&rest, columns, &free_rows, &free_columns) {
             let pivot = rest[i * columns + j];
-            if pivot.abs() <= RANK_TOLERANCE * largest {
+            if pivot.abs() <= tolerance * largest {
                 break;
             }
             for &r in free_rows.iter().filter(|&&r| r != i) {
@@ -208,7 +208,7 @@ mod tests {
         let mut m = vec![vec![2.0, 1.0, 0.5], vec![-1.0, 3.0, 1.0], vec![0.3, -0.7, 1.5]];
         let flat: Vec<f64> = m.concat();
         let mut kernel = Kernel::default();
-        let kept = kernel.factor(&flat, 3, 3);
+        let kept = kernel.factor(&flat, 3, 3, 1e-9);
         // Reorder M as the factorisation kept it.
         m = kept.iter().map(|&(r, _)| kept.iter().map(|&(_, c)| m[r][c]).collect()).collect();
         check(&kernel, &m);
@@ -252,9 +252,9 @@ mod tests {
     fn factor_drops_what_has_no_rank() {
         let mut kernel = Kernel::default();
         // The third row is the sum of the first two.
-        let kept = kernel.factor(&[1.0, 2.0, 0.0, 1.0, 1.0, 3.0], 3, 2);
+        let kept = kernel.factor(&[1.0, 2.0, 0.0, 1.0, 1.0, 3.0], 3, 2, 1e-9);
         assert_eq!(kept.len(), 2);
-        let kept = kernel.factor(&[1.0, 2.0, 2.0, 4.0], 2, 2);
+        let kept = kernel.factor(&[1.0, 2.0, 2.0, 4.0], 2, 2, 1e-9);
         assert_eq!(kept.len(), 1);
     }
 }

@@ -32,8 +32,17 @@ use crate::budget::{Budget, Interruption};
 /// Violation of a scaled row or of a breakpoint that still counts as met. Rows are scaled to
 /// unit effect of an input, so this is in units of the input.
 const FEASIBILITY: f64 = 1e-10;
+/// Rounding of multipliers and gradients that a refactorisation may uncover. What is within it
+/// stays where it is, or a degenerate vertex would come apart at every refactorisation. It grows
+/// tenfold, up to `DRIFT_MAX`, each time an optimum does come apart; the gap decides in the end.
+const DRIFT: f64 = 1e-9;
+const DRIFT_MAX: f64 = 1e-6;
 /// Relative gap accepted at an optimum.
-const GAP: f64 = 1e-9;
+const GAP: f64 = 1e-8;
+/// Rank tolerance for a vertex that came from another program, where rows can be dependent.
+const OTHER_VERTEX: f64 = 1e-9;
+/// Rank tolerance for a vertex that was reached by pivots here: it has full rank, if not much.
+const SAME_VERTEX: f64 = 1e-14;
 /// Pivots between refactorisations.
 const REFRESH_PERIOD: usize = 60;
 /// Pivots between two looks at the budget, some ten microseconds.
@@ -78,6 +87,7 @@ pub struct DualSimplex {
     passed: Vec<ratio::Candidate>,
     costates: Vec<f64>,
     stalled: usize,
+    drift: f64,
 }
 
 const INACTIVE: u32 = u32::MAX;
@@ -134,7 +144,6 @@ enum End {
     Infeasible(Leaving),
     CutOff,
     Exhausted,
-    Trouble,
 }
 
 impl Column {
@@ -158,6 +167,14 @@ impl Column {
         (0..self.last()).find(|&k| -gradient <= self.slopes[k as usize]).unwrap_or(self.last())
     }
 
+    /// Does `point` minimise cost + gradient v to within `drift` of a slope?
+    fn rests_at(&self, point: u8, gradient: f64, drift: f64) -> bool {
+        let pull = -gradient;
+        let above_lower = point == 0 || pull >= self.slopes[point as usize - 1] - drift;
+        let below_upper = point >= self.last() || pull <= self.slopes[point as usize] + drift;
+        point <= self.last() && above_lower && below_upper
+    }
+
     fn cost(&self, value: f64) -> f64 {
         // Integral of the slopes from 0; the breakpoints straddle or exclude 0 by construction.
         match self.count {
@@ -179,7 +196,7 @@ impl Solver for DualSimplex {
         if let Some(basis) = start {
             self.adopt(program, basis);
         }
-        self.refresh(program);
+        self.refresh(program, OTHER_VERTEX);
         let limit = 200 + 20 * self.columns.len();
         let mut pivots = 0;
         let mut doubts = 0;
@@ -196,7 +213,6 @@ impl Solver for DualSimplex {
                     (Status::CutOff, self.multipliers(program), self.lagrangian(program))
                 }
                 End::Exhausted => (Status::BudgetExhausted, Vec::new(), f64::NAN),
-                End::Trouble => (Status::NumericalFailure, Vec::new(), f64::NAN),
             };
             let believed = match status {
                 Status::Optimal => {
@@ -218,7 +234,7 @@ impl Solver for DualSimplex {
                 let failed = Status::NumericalFailure;
                 return Ok(self.solution(program, failed, f64::NAN, Vec::new(), pivots));
             }
-            self.refresh(program);
+            self.refresh(program, SAME_VERTEX);
         }
     }
 }
@@ -250,6 +266,7 @@ impl DualSimplex {
         self.basic.clear();
         self.kernel.clear();
         self.stalled = 0;
+        self.drift = DRIFT;
     }
 
     fn load_rows(&mut self, program: &HorizonProgram<'_>) {
@@ -326,7 +343,7 @@ impl DualSimplex {
     /// Everything anew from the names of active rows and basic columns: coefficients, kernel,
     /// multipliers, gradient, resting places, values. Rows and columns without rank are dropped,
     /// then rows whose multiplier has the wrong sign.
-    fn refresh(&mut self, program: &HorizonProgram<'_>) {
+    fn refresh(&mut self, program: &HorizonProgram<'_>, rank_tolerance: f64) {
         let (rows, columns) = (self.active.len(), self.basic.len());
         let count = self.columns.len();
         self.coefficients.clear();
@@ -342,7 +359,7 @@ impl DualSimplex {
             .flat_map(|i| self.basic.iter().map(move |&c| (i, c)))
             .map(|(i, c)| self.coefficients[i * count + c])
             .collect();
-        let kept = self.kernel.factor(&matrix, rows, columns);
+        let kept = self.kernel.factor(&matrix, rows, columns, rank_tolerance);
         self.keep(&kept);
         self.settle_multipliers(program);
         self.rest_columns();
@@ -396,7 +413,7 @@ impl DualSimplex {
                 })
                 .max_by(|a, b| a.1.total_cmp(&b.1));
             match worst {
-                Some((i, excess, above)) if excess > 1e-12 * (1.0 + multipliers[i].abs()) => {
+                Some((i, excess, above)) if excess > self.drift * (1.0 + multipliers[i].abs()) => {
                     let index = self.active[i].index;
                     let partner = self.kernel.partner_of_row(i);
                     self.place[self.basic[partner]] = Place::At(0);
@@ -491,8 +508,14 @@ impl DualSimplex {
     /// Puts every resting column where its gradient wants it.
     fn rest_columns(&mut self) {
         for i in 0..self.columns.len() {
-            if let Place::At(_) = self.place[i] {
-                let point = self.columns[i].resting_point(self.gradient[i]);
+            if let Place::At(present) = self.place[i] {
+                let column = &self.columns[i];
+                let drift = self.drift * (1.0 + self.gradient[i].abs());
+                let point = if column.rests_at(present, self.gradient[i], drift) {
+                    present
+                } else {
+                    column.resting_point(self.gradient[i])
+                };
                 self.place[i] = Place::At(point);
                 self.values[i] = self.columns[i].points[point as usize];
             }
@@ -557,9 +580,8 @@ impl DualSimplex {
     ) -> Result<End, Interruption> {
         let mut since_refresh = 0;
         let mut best = f64::NEG_INFINITY;
-        let mut troubled = false;
         loop {
-            if *pivots % BUDGET_PERIOD == 0 {
+            if pivots.is_multiple_of(BUDGET_PERIOD) {
                 budget.check()?;
             }
             self.load_values(program);
@@ -574,7 +596,8 @@ impl DualSimplex {
                 if since_refresh == 0 {
                     return Ok(End::Optimal);
                 }
-                self.refresh(program);
+                self.refresh(program, SAME_VERTEX);
+                self.drift = (10.0 * self.drift).min(DRIFT_MAX);
                 since_refresh = 0;
                 continue;
             };
@@ -583,21 +606,18 @@ impl DualSimplex {
             }
             self.direction(program, leaving);
             match self.ratio_test(program, leaving) {
-                ratio::Outcome::Step(step) => {
-                    self.pivot(program, leaving, step);
-                    troubled = false;
+                ratio::Outcome::Step { candidate, sound } => {
+                    self.pivot(program, leaving, candidate);
+                    if !sound {
+                        since_refresh = REFRESH_PERIOD;
+                    }
                 }
                 ratio::Outcome::Unbounded => return Ok(End::Infeasible(leaving)),
-                ratio::Outcome::SmallPivot if troubled => return Ok(End::Trouble),
-                ratio::Outcome::SmallPivot => {
-                    troubled = true;
-                    since_refresh = REFRESH_PERIOD;
-                }
             }
             *pivots += 1;
             since_refresh += 1;
             if since_refresh >= REFRESH_PERIOD {
-                self.refresh(program);
+                self.refresh(program, SAME_VERTEX);
                 since_refresh = 0;
             }
         }

@@ -1,11 +1,12 @@
 //! The dual step: its direction, and how far it goes.
 
-use super::{DualSimplex, HorizonProgram, Leaving, Place};
+use super::{DualSimplex, FEASIBILITY, HorizonProgram, Leaving, Place};
 
-/// Smallest pivot accepted, relative to the largest entry of the step.
-const PIVOT_RELATIVE: f64 = 1e-8;
-/// Smallest pivot accepted at all: rows and columns are scaled to unit effect.
-const PIVOT_ABSOLUTE: f64 = 1e-10;
+/// Entries below this share of the step's largest are rounding of zeros: no breakpoints. A ray
+/// found without them is checked with them, and so is an optimum.
+const NOISE: f64 = 1e-9;
+/// A pivot of at least this share of the step's largest entry is taken without a second thought.
+const SOUND_PIVOT: f64 = 1e-6;
 
 /// A point along the dual step where something changes.
 #[derive(Debug, Clone, Copy)]
@@ -32,12 +33,11 @@ pub(super) enum Event {
 
 /// How the test ended.
 pub(super) enum Outcome {
-    /// Step to this candidate; the columns in `passed` change their resting point.
-    Step(Candidate),
+    /// Step to this candidate; the columns in `passed` change their resting point. Without a
+    /// sound pivot the kernel must be refactored afterwards.
+    Step { candidate: Candidate, sound: bool },
     /// The dual objective rises without end: the program is infeasible.
     Unbounded,
-    /// Every way on needs a pivot too small to trust.
-    SmallPivot,
 }
 
 impl DualSimplex {
@@ -85,8 +85,7 @@ impl DualSimplex {
     /// Long-step ratio test: goes on past breakpoints while the dual objective rises.
     pub(super) fn ratio_test(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) -> Outcome {
         let largest = self.gradient_step.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
-        let smallest_pivot = (PIVOT_RELATIVE * largest).max(PIVOT_ABSOLUTE);
-        self.collect_candidates(program, leaving);
+        self.collect_candidates(program, leaving, NOISE * largest);
         let mut slope = match leaving {
             Leaving::Column { excess, .. } => excess,
             Leaving::Row { residual, .. } => residual.abs(),
@@ -110,39 +109,44 @@ impl DualSimplex {
                 Event::Row { .. } | Event::Flip => break candidate,
             };
             slope -= drop;
-            if slope <= 0.0 {
+            // The slope is the violation that is left: what counts as met needs no further step,
+            // least of all at the very edge of what can be reached.
+            if slope <= FEASIBILITY {
                 break candidate;
             }
             self.queue_next(candidate);
             self.passed.push(candidate);
         };
-        if chosen.size >= smallest_pivot {
-            return Outcome::Step(chosen);
-        }
-        // A shorter step with a sound pivot is still a dual ascent.
-        while let Some(candidate) = self.passed.pop() {
-            if candidate.size >= smallest_pivot {
-                return Outcome::Step(candidate);
+        if chosen.size < SOUND_PIVOT * largest {
+            // A shorter step with a sound pivot is still a dual ascent.
+            let sound = |candidate: &Candidate| candidate.size >= SOUND_PIVOT * largest;
+            if let Some(last) = self.passed.iter().rposition(sound) {
+                let candidate = self.passed[last];
+                self.passed.truncate(last);
+                return Outcome::Step { candidate, sound: true };
             }
+            return Outcome::Step { candidate: chosen, sound: false };
         }
-        Outcome::SmallPivot
+        Outcome::Step { candidate: chosen, sound: true }
     }
 
-    fn collect_candidates(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) {
+    fn collect_candidates(&mut self, program: &HorizonProgram<'_>, leaving: Leaving, noise: f64) {
         self.candidates.clear();
         for index in 0..self.columns.len() {
             let step = self.gradient_step[index];
             let Place::At(point) = self.place[index] else { continue };
-            if step == 0.0 {
+            if step.abs() <= noise {
                 continue;
             }
             self.candidates.extend(self.column_candidate(index, point, step));
         }
+        let row_noise =
+            NOISE * self.multiplier_step.iter().fold(0.0_f64, |a, step| a.max(step.abs()));
         for (position, row) in self.active.iter().enumerate() {
             let step = self.multiplier_step[position];
             let (lower, upper) = self.multiplier_range(program, row.index);
             let bound = if step > 0.0 { upper } else { lower };
-            if step != 0.0 && bound.is_finite() {
+            if step.abs() > row_noise && bound.is_finite() {
                 self.candidates.push(Candidate {
                     length: ((bound - row.multiplier) / step).max(0.0),
                     size: step.abs(),
