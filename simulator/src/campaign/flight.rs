@@ -10,8 +10,8 @@ use rand::SeedableRng as _;
 use rand_chacha::ChaCha12Rng;
 use vbar_client::{Client, ClosedLoop, Code};
 use vbar_proto::v1::{
-    self, Branch, Measurement, StepResponse, VariableHorizonArtifact, measurement, step_response,
-    step_stream_request::Controller,
+    self, Branch, Measurement, StepResponse, VariableHorizonArtifact,
+    VariableHorizonScheme as Scheme, measurement, step_response, step_stream_request::Controller,
 };
 
 use super::{
@@ -27,7 +27,7 @@ use crate::mission::{
 /// Draws of a start before a run gives up.
 pub(crate) const STARTS_MAX: u32 = 10_000;
 
-/// How often a step is asked again when the node is busy, and how long to wait in between.
+/// How often a call is repeated when the node is busy, and how long to wait in between.
 const BUSY_ATTEMPTS_MAX: u32 = 200;
 const BUSY_PAUSE: Duration = Duration::from_millis(5);
 
@@ -144,13 +144,16 @@ impl Flight {
         }
     }
 
-    /// Least margin over all samples and commands, normalised.
+    /// Least margin to the state constraints over all samples, normalised; `None` without any.
     #[must_use]
-    pub fn worst_margin_nd(&self) -> f64 {
-        let states = self.samples.iter().filter_map(|sample| sample.margin_nd);
-        states
-            .chain(self.steps.iter().map(|step| step.input_margin_nd))
-            .fold(f64::INFINITY, f64::min)
+    pub fn worst_margin_nd(&self) -> Option<f64> {
+        self.samples.iter().filter_map(|sample| sample.margin_nd).reduce(f64::min)
+    }
+
+    /// Least margin to the input constraints over all commands, normalised.
+    #[must_use]
+    pub fn worst_input_margin_nd(&self) -> Option<f64> {
+        self.steps.iter().map(|step| step.input_margin_nd).reduce(f64::min)
     }
 
     /// First step at which the state or the command was outside.
@@ -255,6 +258,28 @@ pub(crate) fn stream_of_chance(seed: u64, run: u32, purpose: u64) -> ChaCha12Rng
     chance
 }
 
+/// A node that is busy says RESOURCE_EXHAUSTED at once; it is asked again a little later.
+struct Patience {
+    run: u32,
+    attempts: u32,
+}
+
+impl Patience {
+    fn new(run: u32) -> Self {
+        Self { run, attempts: 0 }
+    }
+
+    /// Waits if the node was busy; any other error, or too many, ends the run.
+    async fn after(&mut self, error: vbar_client::Error) -> Result<(), SimulationError> {
+        self.attempts += 1;
+        if error.code != Code::ResourceExhausted || self.attempts >= BUSY_ATTEMPTS_MAX {
+            return Err(SimulationError::Client { run: self.run, source: error });
+        }
+        tokio::time::sleep(error.retry_after.unwrap_or(BUSY_PAUSE)).await;
+        Ok(())
+    }
+}
+
 /// Has the artifact of `problem` made; the inner error is the service's reason.
 async fn prepare(
     client: &Client,
@@ -262,10 +287,13 @@ async fn prepare(
     problem: v1::Problem,
 ) -> Result<Result<Prepared, String>, SimulationError> {
     let model = Model::new(&problem).map_err(crate::mission::MissionError::Invalid)?;
-    let made = client
-        .precompute(problem)
-        .await
-        .map_err(|source| SimulationError::Client { run, source })?;
+    let mut patience = Patience::new(run);
+    let made = loop {
+        match client.precompute(problem.clone()).await {
+            Ok(made) => break made,
+            Err(error) => patience.after(error).await?,
+        }
+    };
     let answer = |what: &str| SimulationError::Answer { run, what: what.to_owned() };
     let made = match made.outcome {
         Some(v1::precompute_response::Outcome::Artifact(artifact)) => artifact,
@@ -317,7 +345,7 @@ async fn close_loop(
             }
             Decision::Arrived => {
                 flight.outcome = Outcome::Arrived;
-                flight.final_set_radius = final_set_radius(&flight, &prepared.sets);
+                flight.final_set_radius = final_set_radius(&flight, plan, &prepared.sets);
                 break;
             }
             Decision::Infeasible(reason) => {
@@ -329,10 +357,16 @@ async fn close_loop(
     Ok(flight)
 }
 
-/// Radius of S(N) with N the horizon at which the terminal point was last adapted.
-fn final_set_radius(flight: &Flight, sets: &ErrorSets) -> Option<f64> {
-    let terms = usize::try_from(flight.steps.last()?.adapted_horizon).ok()?;
-    let generators = sets.generators(terms);
+/// Radius of the set the scheme guarantees around its terminal point: S(N) with N the horizon at
+/// which that point was last adapted, S(infinity) for the fixed terminal set, none without a tube.
+fn final_set_radius(flight: &Flight, plan: &Plan, sets: &ErrorSets) -> Option<f64> {
+    let generators = match plan.mission.scheme() {
+        Scheme::AdaptiveTerminal | Scheme::TubeOptimalControl => {
+            sets.generators(usize::try_from(flight.steps.last()?.adapted_horizon).ok()?)
+        }
+        Scheme::FixedTerminal => sets.generators_of_limit(),
+        Scheme::Nominal | Scheme::Unspecified => return None,
+    };
     Some(match flight.position_unit_m() {
         Some(unit) => radius(&generators, 3) * unit,
         None => radius(&generators, generators.nrows()),
@@ -405,31 +439,20 @@ impl Session {
         state: &DVector<f64>,
     ) -> Result<(Decision, Option<v1::Prediction>), SimulationError> {
         let asked = Instant::now();
-        let response = self.ask(state).await?;
+        let question = self.measurement(state);
+        let mut patience = Patience::new(self.run);
+        let response = loop {
+            match self.closed_loop.step(question.clone()).await {
+                Ok(response) => break response,
+                Err(error) => patience.after(error).await?,
+            }
+        };
         let latency = asked.elapsed();
         let prediction = response.prediction.clone();
         let decision = self.read(response, state, latency);
         let run = self.run;
         let decision = decision.map_err(|what| SimulationError::Answer { run, what })?;
         Ok((decision, prediction))
-    }
-
-    /// A node that is busy says RESOURCE_EXHAUSTED at once; the loop is asked again a little later.
-    async fn ask(&mut self, state: &DVector<f64>) -> Result<StepResponse, SimulationError> {
-        let question = self.measurement(state);
-        let mut attempt = 0;
-        loop {
-            attempt += 1;
-            match self.closed_loop.step(question.clone()).await {
-                Ok(response) => return Ok(response),
-                Err(busy)
-                    if busy.code == Code::ResourceExhausted && attempt < BUSY_ATTEMPTS_MAX =>
-                {
-                    tokio::time::sleep(busy.retry_after.unwrap_or(BUSY_PAUSE)).await;
-                }
-                Err(source) => return Err(SimulationError::Client { run: self.run, source }),
-            }
-        }
     }
 
     fn measurement(&self, state: &DVector<f64>) -> Measurement {

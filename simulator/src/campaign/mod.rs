@@ -32,8 +32,9 @@ use crate::{
 pub use flight::Flight;
 pub use progress::{Progress, ProgressBar, Silent};
 
-/// Runs in flight at once unless the options say otherwise.
-const CONCURRENCY_DEFAULT: usize = 16;
+/// Runs in flight for every computation the server does at once: enough to keep it busy while
+/// answers travel, few enough that latency is not mostly waiting.
+const FLIGHTS_PER_COMPUTATION: usize = 2;
 
 /// Most runs in flight at once.
 const CONCURRENCY_MAX: usize = 1024;
@@ -75,7 +76,7 @@ pub struct RunOptions {
     pub runs: Option<u32>,
     /// Start of every stream of chance.
     pub seed: u64,
-    /// Runs in flight at once; the server's limit on computations bounds it too.
+    /// Runs in flight at once, instead of twice what the server computes at once.
     pub concurrency: Option<NonZeroUsize>,
     /// Fly this variant of the mission.
     pub variant: Option<String>,
@@ -230,14 +231,16 @@ fn chosen_schemes(mission: &Mission, options: &RunOptions) -> Result<Vec<Scheme>
     }
 }
 
-/// As many runs at once as asked for, but never more than the server computes at once: beyond
-/// that it would refuse.
+/// As many runs at once as asked for, else by what the server says it computes at once.
 async fn concurrency(client: &Client, options: &RunOptions) -> Result<usize, SimulationError> {
-    let info =
-        client.server_info().await.map_err(|source| SimulationError::Client { run: 0, source })?;
-    let limit = info.limits.map_or(0, |limits| limits.concurrent_computations_max);
-    let limit = usize::try_from(limit).unwrap_or(0).clamp(1, CONCURRENCY_MAX);
-    Ok(options.concurrency.map_or(CONCURRENCY_DEFAULT, NonZeroUsize::get).min(limit))
+    if let Some(asked) = options.concurrency {
+        return Ok(asked.get().min(CONCURRENCY_MAX));
+    }
+    let info = client.server_info().await;
+    let info = info.map_err(|source| SimulationError::Client { run: 0, source })?;
+    let limit = info.limits.map_or(1, |limits| limits.concurrent_computations_max);
+    let limit = usize::try_from(limit).unwrap_or(1).max(1);
+    Ok(limit.saturating_mul(FLIGHTS_PER_COMPUTATION).min(CONCURRENCY_MAX))
 }
 
 /// The single run that is drawn step by step, for every scheme the mission compares.

@@ -113,6 +113,9 @@ pub(crate) struct Variant {
     pub truth: Option<TruthLaw>,
     pub initial_state: Option<InitialLaw>,
     pub disturbance: Option<DisturbanceLaw>,
+    /// Figures for this variant; the mission's own do not apply to it.
+    #[serde(default)]
+    pub published: Published,
 }
 
 #[derive(Deserialize)]
@@ -182,6 +185,7 @@ impl Mission {
         if let Some(disturbance) = &variant.disturbance {
             simulation.disturbance = disturbance.clone();
         }
+        changed.published.clone_from(&variant.published);
         Some(changed)
     }
 

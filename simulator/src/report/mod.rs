@@ -125,14 +125,17 @@ pub struct Summary {
     pub constraint_violations: usize,
     /// Mean step of the first violation, over the runs that have one.
     pub first_violation_step: Option<f64>,
-    /// Least margin over all runs, normalised.
-    pub worst_margin: f64,
+    /// Least margin to the state constraints over all runs, normalised; none without any.
+    pub worst_margin: Option<f64>,
     /// The same in metres, taken run by run.
     pub worst_margin_m: Option<f64>,
+    /// Least margin to the input constraints, normalised; 0 is a command at its bound.
+    pub worst_input_margin: Option<f64>,
     /// Metrics by their name in the report.
     pub metrics: Vec<(&'static str, Statistics)>,
-    /// Share of steps whose command came from the grown terminal set.
-    pub fallback_share: f64,
+    /// Share of steps whose command came from the grown terminal set; only the adaptive scheme
+    /// has one.
+    pub fallback_share: Option<f64>,
     /// Commands in total.
     pub steps: usize,
     /// Commands whose certificate did not pass.
@@ -156,7 +159,8 @@ impl Summary {
         let count = steps().count();
         let fallback = steps().filter(|step| step.branch == Branch::TerminalSet).count();
         let in_metres =
-            |flight: &Flight| Some(flight.worst_margin_nd() * flight.position_unit_m()?);
+            |flight: &Flight| Some(flight.worst_margin_nd()? * flight.position_unit_m()?);
+        let adaptive = campaign.scheme == Scheme::AdaptiveTerminal && count > 0;
         Self {
             scheme: campaign.scheme,
             runs: flights.len(),
@@ -168,10 +172,14 @@ impl Summary {
                 .count(),
             constraint_violations: first.len(),
             first_violation_step: Statistics::of(first).map(|s| s.mean),
-            worst_margin: flights.iter().map(Flight::worst_margin_nd).fold(f64::INFINITY, f64::min),
+            worst_margin: flights.iter().filter_map(Flight::worst_margin_nd).reduce(f64::min),
+            worst_input_margin: flights
+                .iter()
+                .filter_map(Flight::worst_input_margin_nd)
+                .reduce(f64::min),
             worst_margin_m: flights.iter().filter_map(in_metres).reduce(f64::min),
-            metrics: metrics(flights),
-            fallback_share: if count == 0 { 0.0 } else { fallback as f64 / count as f64 },
+            metrics: metrics(campaign),
+            fallback_share: adaptive.then(|| fallback as f64 / count as f64),
             steps: count,
             uncertified_steps: steps().filter(|step| !step.certified).count(),
             outside_assumed_set_steps: steps().filter(|step| step.outside_assumed_set).count(),
@@ -201,7 +209,8 @@ impl Summary {
         }
         put("constraint_violations", self.constraint_violations.into());
         put("first_violation_step", self.first_violation_step.into());
-        put("worst_margin", finite(self.worst_margin));
+        put("worst_margin", self.worst_margin.into());
+        put("worst_input_margin", self.worst_input_margin.into());
         put("worst_margin_m", self.worst_margin_m.into());
         put("fallback_share", self.fallback_share.into());
         put("steps", self.steps.into());
@@ -214,15 +223,19 @@ impl Summary {
     }
 }
 
-fn metrics(flights: &[Flight]) -> Vec<(&'static str, Statistics)> {
+fn metrics(campaign: &Campaign) -> Vec<(&'static str, Statistics)> {
+    let flights = &campaign.flights;
     let arrived = || flights.iter().filter(|flight| flight.arrived());
     let metres = flights.iter().any(|flight| flight.position_unit_m().is_some());
     let (distance, radius) = match metres {
         true => ("final_distance_m", "final_set_radius_m"),
         false => ("final_norm", "final_set_radius"),
     };
-    let last_horizon =
-        |flight: &Flight| flight.steps.last().map(|step| f64::from(step.adapted_horizon));
+    // The other schemes have no terminal point that is adapted.
+    let adapts = matches!(campaign.scheme, Scheme::AdaptiveTerminal | Scheme::TubeOptimalControl);
+    let last_horizon = |flight: &Flight| {
+        flight.steps.last().filter(|_| adapts).map(|step| f64::from(step.adapted_horizon))
+    };
     let all = [
         (distance, Statistics::of(arrived().map(Flight::final_distance))),
         ("fuel", Statistics::of(arrived().map(Flight::fuel))),
@@ -244,7 +257,7 @@ fn latency_ms(flights: &[Flight]) -> Option<(f64, f64)> {
     (!histogram.is_empty()).then(|| (quantile(0.5), quantile(0.99)))
 }
 
-/// Infinity has no place in JSON; it stands for "no constraint" here.
+/// JSON has no number for a mean over nothing.
 fn finite(value: f64) -> Value {
     if value.is_finite() { value.into() } else { Value::Null }
 }

@@ -61,27 +61,23 @@ fn scheme(report: &Report, summary: &Summary) -> String {
         let paper = if paper.is_empty() { paper } else { format!(", published {paper}") };
         format!(" (first at step {step:.1} on average{paper})")
     });
-    let metres =
-        summary.worst_margin_m.map_or_else(String::new, |margin| format!(" ({margin:.3} m)"));
     let _ = writeln!(
         text,
         "  arrived {} of {}; infeasible {}; starts drawn again {}\n  \
-         runs with a violation {}{first}; worst margin {:.3e}{metres}",
+         runs with a violation {}{first}; worst margin {}",
         summary.arrived,
         summary.runs,
         summary.infeasible,
         summary.redraws,
         summary.constraint_violations,
-        summary.worst_margin,
+        margins(summary),
     );
-    let fallback = published(report, name, "fallback_share");
-    let fallback = if fallback.is_empty() { fallback } else { format!(" (published {fallback})") };
     let _ = writeln!(
         text,
-        "  steps {}; fallback share {:.3}{fallback}; without certificate {}; disturbance outside \
-         its set {}; programs for the general solver {}",
+        "  steps {}{}; without certificate {}; disturbance outside its set {}; programs for the \
+         general solver {}",
         summary.steps,
-        summary.fallback_share,
+        fallback(report, summary),
         summary.uncertified_steps,
         summary.outside_assumed_set_steps,
         summary.general_solver_calls,
@@ -90,6 +86,21 @@ fn scheme(report: &Report, summary: &Summary) -> String {
         let _ = writeln!(text, "  step latency p50 {p50:.3} ms, p99 {p99:.3} ms");
     }
     text
+}
+
+fn margins(summary: &Summary) -> String {
+    let state = summary.worst_margin.map(|margin| format!("{margin:.3e}"));
+    let metres = summary.worst_margin_m.map(|margin| format!(" ({margin:.3} m)"));
+    let input = summary.worst_input_margin.map(|margin| format!(", of the input {margin:.3e}"));
+    let parts = [state.or(Some("none".into())), metres, input];
+    parts.into_iter().flatten().collect()
+}
+
+fn fallback(report: &Report, summary: &Summary) -> String {
+    let Some(share) = summary.fallback_share else { return String::new() };
+    let paper = published(report, scheme_name(summary.scheme), "fallback_share");
+    let paper = if paper.is_empty() { paper } else { format!(" (published {paper})") };
+    format!("; fallback share {share:.3}{paper}")
 }
 
 /// Means side by side, percent against the first, as Table 1 of [Quartullo2025a].
