@@ -42,6 +42,11 @@ impl Failure {
     pub(crate) fn cannot_write(message: impl Into<String>) -> Self {
         Self { code: CANNOT_WRITE, message: message.into() }
     }
+
+    /// The same, in run number `run` of a campaign.
+    pub(crate) fn in_run(self, run: u32) -> Self {
+        Self { message: format!("run {run}: {}", self.message), ..self }
+    }
 }
 
 impl fmt::Display for Failure {

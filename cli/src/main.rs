@@ -7,6 +7,7 @@
 mod calls;
 mod failure;
 mod json;
+mod log;
 mod serve;
 mod session;
 mod simulate;
@@ -27,6 +28,8 @@ use failure::{Failure, USAGE};
 struct Arguments {
     #[command(subcommand)]
     command: Command,
+    #[command(flatten)]
+    log: log::LogArguments,
 }
 
 #[derive(Debug, Subcommand)]
@@ -55,7 +58,8 @@ fn main() -> ExitCode {
             return ExitCode::from(code);
         }
     };
-    match run(arguments.command) {
+    let filter = if matches!(arguments.command, Command::Serve(_)) { "info" } else { "warn" };
+    match log::start(&arguments.log, filter).and_then(|()| run(arguments.command)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             eprintln!("vbar: {failure}");

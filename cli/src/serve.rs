@@ -2,14 +2,12 @@
 
 use std::{
     env, fs,
-    io::{self, IsTerminal as _},
     net::SocketAddr,
     path::{Path, PathBuf},
 };
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use tokio::signal::unix::{Signal, SignalKind, signal};
-use tracing_subscriber::EnvFilter;
 use vbar_server::{Config, Node, Settings};
 
 use crate::{failure::Failure, json};
@@ -44,31 +42,14 @@ pub(crate) struct ServeArguments {
     /// Check the configuration, name every fault, and end
     #[arg(long)]
     check_config: bool,
-    /// What to log: error, warn, info, debug, trace, or per module as in vbar_server=debug
-    #[arg(long, value_name = "FILTER", env = "VBAR_LOG", default_value = "info")]
-    log: String,
-    /// How to log, on standard error
-    #[arg(long, value_name = "FORMAT", env = "VBAR_LOG_FORMAT", default_value = "text")]
-    log_format: LogFormat,
-}
-
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum LogFormat {
-    /// For people
-    Text,
-    /// One JSON object a line
-    Json,
 }
 
 /// Runs a node until it is told to stop, then lets it finish what it began.
 pub(crate) async fn serve(arguments: ServeArguments) -> Result<(), Failure> {
     let config = configuration(&arguments)?;
-    let filter = EnvFilter::try_new(&arguments.log)
-        .map_err(|fault| Failure::usage(format!("--log: {fault}")))?;
     if arguments.check_config {
         return json::print("the configuration has no faults");
     }
-    log(filter, arguments.log_format);
     let (mut terminate, mut interrupt) =
         (on(SignalKind::terminate())?, on(SignalKind::interrupt())?);
     let node = Node::start(config)
@@ -127,17 +108,6 @@ fn from_file(path: &Path) -> Result<Settings, String> {
     }
     let text = fs::read_to_string(path).map_err(|fault| named(fault.to_string()))?;
     Settings::from_toml(&text).map_err(|fault| named(fault.to_string()))
-}
-
-fn log(filter: EnvFilter, format: LogFormat) {
-    let lines = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_ansi(io::stderr().is_terminal())
-        .with_writer(io::stderr);
-    match format {
-        LogFormat::Text => lines.init(),
-        LogFormat::Json => lines.json().init(),
-    }
 }
 
 fn on(kind: SignalKind) -> Result<Signal, Failure> {

@@ -148,7 +148,7 @@ fn failure(error: vbar_simulator::SimulationError) -> Failure {
     let message = error.to_string();
     match error {
         Error::Options(_) => Failure::usage(message),
-        Error::Client { source, .. } => Failure::from(source),
+        Error::Client { run, source } => Failure::from(source).in_run(run),
         Error::Mission(_) | Error::NoStart { .. } => Failure::data(message),
         Error::Answer { .. } | Error::Task(_) => Failure::ours(message),
     }

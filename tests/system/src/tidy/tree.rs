@@ -30,8 +30,9 @@ impl Tree {
         for entry in fs::read_dir(root)? {
             let entry = entry?;
             let name = entry.file_name().to_string_lossy().into_owned();
-            // What git does not keep is not part of the house.
-            if ["target", "out", ".git"].contains(&name.as_str()) {
+            // What git does not keep is not part of the house, nor are the folders of tools.
+            let hidden = name.starts_with('.') && name != ".ci" && entry.file_type()?.is_dir();
+            if hidden || ["target", "out", ".git"].contains(&name.as_str()) {
                 continue;
             }
             if entry.file_type()?.is_dir() {
