@@ -13,7 +13,7 @@ use axum::{
     response::{IntoResponse as _, Response},
     routing::{get, post},
 };
-use http::{HeaderMap, HeaderValue, StatusCode, header};
+use http::{HeaderMap, HeaderValue, StatusCode, header, request::Parts};
 use http_body_util::{BodyExt as _, LengthLimitError, Limited};
 use prost::{Message, Name};
 use vbar_proto::{google::longrunning, v1};
@@ -222,7 +222,7 @@ impl Http {
     async fn call(
         &self,
         request: Request,
-        answer: impl AsyncFnOnce(&Self, (http::request::Parts, Body)) -> Result<Response, HttpError>,
+        answer: impl AsyncFnOnce(&Self, (Parts, Body)) -> Result<Response, HttpError>,
     ) -> Response {
         let id = request.extensions().get().cloned().unwrap_or_else(RequestId::fresh);
         match answer(self, request.into_parts()).await {
@@ -232,11 +232,7 @@ impl Http {
     }
 
     /// Reads the request's message.
-    async fn message<P, M>(
-        &self,
-        parts: &http::request::Parts,
-        body: Body,
-    ) -> Result<(P, Call), HttpError>
+    async fn message<P, M>(&self, parts: &Parts, body: Body) -> Result<(P, Call), HttpError>
     where
         P: Parse<Message = M>,
         M: Message + Name + Default,
@@ -249,11 +245,7 @@ impl Http {
 
     /// A message of which nothing is needed, and which may be left out; if it is there, it must
     /// be one.
-    async fn optional_message<M>(
-        &self,
-        parts: &http::request::Parts,
-        body: Body,
-    ) -> Result<(), HttpError>
+    async fn optional_message<M>(&self, parts: &Parts, body: Body) -> Result<(), HttpError>
     where
         M: Message + Name + Default,
     {
@@ -269,7 +261,7 @@ impl Http {
     /// Checks a message and reads what every call brings.
     fn parsed<P: Parse>(
         &self,
-        parts: &http::request::Parts,
+        parts: &Parts,
         message: &P::Message,
     ) -> Result<(P, Call), HttpError> {
         let wish = match parts.headers.get(TIMEOUT) {
@@ -329,7 +321,7 @@ fn is_json(headers: &HeaderMap) -> Result<(), HttpError> {
 }
 
 /// Unknown fields are refused, wherever they stand.
-fn no_query(parts: &http::request::Parts) -> Result<(), HttpError> {
+fn no_query(parts: &Parts) -> Result<(), HttpError> {
     match parts.uri.query() {
         None | Some("") => Ok(()),
         Some(query) => Err(Error::field("query", "no query parameters", query).into()),
