@@ -11,9 +11,9 @@ use axum::{
     body::{Body, Bytes},
     extract::{Path, Request, State},
     response::{IntoResponse as _, Response},
-    routing::{get, post},
+    routing::{any, get, post},
 };
-use http::{HeaderMap, HeaderValue, StatusCode, header, request::Parts};
+use http::{HeaderMap, HeaderValue, Method, StatusCode, header, request::Parts};
 use http_body_util::{BodyExt as _, LengthLimitError, Limited};
 use prost::{Message, Name};
 use vbar_proto::{google::longrunning, v1};
@@ -57,10 +57,7 @@ pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Rout
         .route("/v1/plans:compute", post(compute_plan))
         .route("/v1/precompute", post(precompute))
         .route("/v1/operations", get(list_operations))
-        .route(
-            "/v1/operations/{id}",
-            get(get_operation).post(steer_operation).delete(delete_operation),
-        )
+        .route("/v1/operations/{id}", any(operation))
         .route("/v1/artifacts/{id}", get(get_artifact))
         .route("/v1/step", post(step))
         .route("/v1/info", get(info))
@@ -127,52 +124,43 @@ async fn list_operations(State(http): Shared, request: Request) -> Response {
     .await
 }
 
-async fn get_operation(State(http): Shared, Path(id): Path<String>, request: Request) -> Response {
-    http.call(request, async |http: &Http, (parts, _)| {
-        no_query(&parts)?;
-        let (ask, call) = http.parsed(&parts, &NamedBy::operation(&id))?;
-        Ok(rendered(&http.service.operation(ask, &call).await?))
-    })
-    .await
-}
-
-async fn delete_operation(
-    State(http): Shared,
-    Path(id): Path<String>,
-    request: Request,
-) -> Response {
-    http.call(request, async |http: &Http, (parts, _)| {
-        no_query(&parts)?;
-        let (ask, call) = http.parsed(&parts, &NamedBy::operation(&id))?;
-        http.service.delete_operation(ask, &call).await?;
-        Ok(empty())
-    })
-    .await
-}
-
-/// `POST /v1/operations/{id}:wait` and `:cancel`. The router takes whole segments only.
-async fn steer_operation(
-    State(http): Shared,
-    Path(segment): Path<String>,
-    request: Request,
-) -> Response {
+/// `GET` and `DELETE /v1/operations/{id}`, `POST /v1/operations/{id}:wait` and `:cancel`.
+///
+/// The router takes whole segments only, so the verb and what it allows are told apart here.
+async fn operation(State(http): Shared, Path(segment): Path<String>, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, body)| {
-        no_query(&parts)?;
-        let (id, verb) = segment.rsplit_once(':').unwrap_or((&segment, ""));
+        let (id, verb) = match segment.rsplit_once(':') {
+            Some((id, verb @ ("wait" | "cancel"))) => (id, verb),
+            _ => (segment.as_str(), ""),
+        };
         let by_name = NamedBy::operation(id);
-        match verb {
-            "wait" => {
+        match (&parts.method, verb) {
+            (&Method::GET | &Method::HEAD, "") => {
+                no_query(&parts)?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                Ok(rendered(&http.service.operation(ask, &call).await?))
+            }
+            (&Method::DELETE, "") => {
+                no_query(&parts)?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                http.service.delete_operation(ask, &call).await?;
+                Ok(empty())
+            }
+            (&Method::POST, "wait") => {
+                no_query(&parts)?;
                 http.optional_message::<longrunning::WaitOperationRequest>(&parts, body).await?;
                 let (ask, call) = http.parsed(&parts, &by_name)?;
                 Ok(rendered(&http.service.operation(ask, &call).await?))
             }
-            "cancel" => {
+            (&Method::POST, "cancel") => {
+                no_query(&parts)?;
                 http.optional_message::<longrunning::CancelOperationRequest>(&parts, body).await?;
                 let (ask, call) = http.parsed(&parts, &by_name)?;
                 http.service.cancel_operation(ask, &call).await?;
                 Ok(empty())
             }
-            _ => Err(HttpError::method_not_allowed("GET, DELETE")),
+            (_, "") => Err(HttpError::method_not_allowed("GET,HEAD,DELETE")),
+            _ => Err(HttpError::method_not_allowed("POST")),
         }
     })
     .await
