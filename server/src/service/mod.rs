@@ -175,7 +175,8 @@ impl Service {
         self.load(ask.id, call).await
     }
 
-    /// `GetOperation` and `WaitOperation`: there is nothing to wait for, see [`Service::precompute`].
+    /// `GetOperation` and `WaitOperation`: there is nothing to wait for, because
+    /// [`Service::precompute`] answers when it is done.
     pub(crate) async fn operation(
         &self,
         ask: OperationName,

@@ -24,6 +24,8 @@ pub(crate) use grpc::Draining;
 
 /// Domain of the reasons in `google.rpc.ErrorInfo`.
 const ERROR_DOMAIN: &str = "vbar";
+const GRPC_STATUS: &str = "grpc-status";
+const GRPC_DETAILS: &str = "grpc-status-details-bin";
 const REQUEST_ID: &str = "x-request-id";
 /// Where the time a compute thread took travels: never in the message, because the same request
 /// must give the same bytes.
@@ -70,6 +72,12 @@ impl Front {
             Ok(response) => response,
             Err(never) => match never {},
         };
+        if response.headers().contains_key(GRPC_STATUS)
+            && !response.headers().contains_key(GRPC_DETAILS)
+            && let Some(status) = tonic::Status::from_header_map(response.headers())
+        {
+            response = grpc::complete(status, &id).into_http();
+        }
         let code = code_name(&response);
         let elapsed = start.elapsed();
         if let Ok(value) = HeaderValue::from_str(&id.0) {
@@ -145,7 +153,7 @@ fn code_name(response: &Response<Body>) -> &'static str {
     ];
     let number = match response.extensions().get::<AnsweredWith>() {
         Some(AnsweredWith(number)) => usize::try_from(*number).ok(),
-        None => match response.headers().get("grpc-status") {
+        None => match response.headers().get(GRPC_STATUS) {
             Some(value) => value.to_str().ok().and_then(|text| text.parse().ok()),
             None => Some(0),
         },

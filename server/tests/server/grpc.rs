@@ -122,12 +122,18 @@ async fn grpc_unknown_field_and_garbage_are_refused() {
     let unknown = raw_call(&server, STEP, &[0xe8, 0x04, 0x01]).await;
     assert_eq!(unknown.code(), Code::InvalidArgument);
     assert!(unknown.message().contains("77"), "{unknown}");
+    let details = unknown.get_error_details();
+    assert_eq!(details.error_info().unwrap().reason, "MALFORMED_MESSAGE");
+    assert_eq!(details.request_info().unwrap().request_id.len(), 32);
     let garbage = raw_call(&server, STEP, &[0x0a, 0xff, 0xff]).await;
     assert_eq!(garbage.code(), Code::InvalidArgument, "{garbage}");
     let nowhere = raw_call(&server, "/vbar.v1.GuidanceService/Teleport", &[]).await;
     assert_eq!(nowhere.code(), Code::Unimplemented);
     let nobody = raw_call(&server, "/vbar.v9.Nobody/Step", &[]).await;
     assert_eq!(nobody.code(), Code::Unimplemented);
+    for status in [nowhere, nobody] {
+        assert_eq!(status.get_error_details().error_info().unwrap().reason, "METHOD_UNKNOWN");
+    }
     let metric = r#"vbar_requests_total{method="Step",transport="grpc",code="INVALID_ARGUMENT"}"#;
     assert_eq!(server.metric(metric).await, 2.0);
 }

@@ -133,7 +133,7 @@ impl Loop {
             // The message could not be read; the stream behind it can be in any state.
             Err(fault) => {
                 self.over = true;
-                return Some(Err(fault));
+                return Some(Err(status::complete(fault, &self.id)));
             }
             Ok(Some(message)) => self.answer(&message).await,
         };

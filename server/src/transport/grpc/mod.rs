@@ -21,6 +21,8 @@ use crate::{
     wire::{Parse, parse},
 };
 
+pub(super) use status::complete;
+
 /// Tells those who wait that the node is about to stop.
 pub(crate) type Draining = watch::Receiver<bool>;
 

@@ -11,9 +11,9 @@ use axum::{
     body::{Body, Bytes},
     extract::{Path, Request, State},
     response::{IntoResponse as _, Response},
-    routing::{get, post},
+    routing::{any, get, post},
 };
-use http::{HeaderMap, HeaderValue, StatusCode, header};
+use http::{HeaderMap, HeaderValue, Method, StatusCode, header, request::Parts};
 use http_body_util::{BodyExt as _, LengthLimitError, Limited};
 use prost::{Message, Name};
 use vbar_proto::{google::longrunning, v1};
@@ -56,10 +56,7 @@ pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Rout
         .route("/v1/plans:compute", post(compute_plan))
         .route("/v1/precompute", post(precompute))
         .route("/v1/operations", get(list_operations))
-        .route(
-            "/v1/operations/{id}",
-            get(get_operation).post(steer_operation).delete(delete_operation),
-        )
+        .route("/v1/operations/{id}", any(operation))
         .route("/v1/artifacts/{id}", get(get_artifact))
         .route("/v1/step", post(step))
         .route("/v1/info", get(info))
@@ -126,52 +123,43 @@ async fn list_operations(State(http): Shared, request: Request) -> Response {
     .await
 }
 
-async fn get_operation(State(http): Shared, Path(id): Path<String>, request: Request) -> Response {
-    http.call(request, async |http: &Http, (parts, _)| {
-        no_query(&parts)?;
-        let (ask, call) = http.parsed(&parts, &NamedBy::operation(&id))?;
-        Ok(rendered(&http.service.operation(ask, &call).await?))
-    })
-    .await
-}
-
-async fn delete_operation(
-    State(http): Shared,
-    Path(id): Path<String>,
-    request: Request,
-) -> Response {
-    http.call(request, async |http: &Http, (parts, _)| {
-        no_query(&parts)?;
-        let (ask, call) = http.parsed(&parts, &NamedBy::operation(&id))?;
-        http.service.delete_operation(ask, &call).await?;
-        Ok(empty())
-    })
-    .await
-}
-
-/// `POST /v1/operations/{id}:wait` and `:cancel`. The router takes whole segments only.
-async fn steer_operation(
-    State(http): Shared,
-    Path(segment): Path<String>,
-    request: Request,
-) -> Response {
+/// `GET` and `DELETE /v1/operations/{id}`, `POST /v1/operations/{id}:wait` and `:cancel`.
+///
+/// The router takes whole segments only, so the verb and what it allows are told apart here.
+async fn operation(State(http): Shared, Path(segment): Path<String>, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, body)| {
-        no_query(&parts)?;
-        let (id, verb) = segment.rsplit_once(':').unwrap_or((&segment, ""));
+        let (id, verb) = match segment.rsplit_once(':') {
+            Some((id, verb @ ("wait" | "cancel"))) => (id, verb),
+            _ => (segment.as_str(), ""),
+        };
         let by_name = NamedBy::operation(id);
-        match verb {
-            "wait" => {
+        match (&parts.method, verb) {
+            (&Method::GET | &Method::HEAD, "") => {
+                no_query(&parts)?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                Ok(rendered(&http.service.operation(ask, &call).await?))
+            }
+            (&Method::DELETE, "") => {
+                no_query(&parts)?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                http.service.delete_operation(ask, &call).await?;
+                Ok(empty())
+            }
+            (&Method::POST, "wait") => {
+                no_query(&parts)?;
                 http.optional_message::<longrunning::WaitOperationRequest>(&parts, body).await?;
                 let (ask, call) = http.parsed(&parts, &by_name)?;
                 Ok(rendered(&http.service.operation(ask, &call).await?))
             }
-            "cancel" => {
+            (&Method::POST, "cancel") => {
+                no_query(&parts)?;
                 http.optional_message::<longrunning::CancelOperationRequest>(&parts, body).await?;
                 let (ask, call) = http.parsed(&parts, &by_name)?;
                 http.service.cancel_operation(ask, &call).await?;
                 Ok(empty())
             }
-            _ => Err(HttpError::method_not_allowed("GET, DELETE")),
+            (_, "") => Err(HttpError::method_not_allowed("GET,HEAD,DELETE")),
+            _ => Err(HttpError::method_not_allowed("POST")),
         }
     })
     .await
@@ -221,7 +209,7 @@ impl Http {
     async fn call(
         &self,
         request: Request,
-        answer: impl AsyncFnOnce(&Self, (http::request::Parts, Body)) -> Result<Response, HttpError>,
+        answer: impl AsyncFnOnce(&Self, (Parts, Body)) -> Result<Response, HttpError>,
     ) -> Response {
         let id = request.extensions().get().cloned().unwrap_or_else(RequestId::fresh);
         match answer(self, request.into_parts()).await {
@@ -231,11 +219,7 @@ impl Http {
     }
 
     /// Reads the request's message.
-    async fn message<P, M>(
-        &self,
-        parts: &http::request::Parts,
-        body: Body,
-    ) -> Result<(P, Call), HttpError>
+    async fn message<P, M>(&self, parts: &Parts, body: Body) -> Result<(P, Call), HttpError>
     where
         P: Parse<Message = M>,
         M: Message + Name + Default,
@@ -248,11 +232,7 @@ impl Http {
 
     /// A message of which nothing is needed, and which may be left out; if it is there, it must
     /// be one.
-    async fn optional_message<M>(
-        &self,
-        parts: &http::request::Parts,
-        body: Body,
-    ) -> Result<(), HttpError>
+    async fn optional_message<M>(&self, parts: &Parts, body: Body) -> Result<(), HttpError>
     where
         M: Message + Name + Default,
     {
@@ -268,7 +248,7 @@ impl Http {
     /// Checks a message and reads what every call brings.
     fn parsed<P: Parse>(
         &self,
-        parts: &http::request::Parts,
+        parts: &Parts,
         message: &P::Message,
     ) -> Result<(P, Call), HttpError> {
         let wish = match parts.headers.get(TIMEOUT) {
@@ -328,7 +308,7 @@ fn is_json(headers: &HeaderMap) -> Result<(), HttpError> {
 }
 
 /// Unknown fields are refused, wherever they stand.
-fn no_query(parts: &http::request::Parts) -> Result<(), HttpError> {
+fn no_query(parts: &Parts) -> Result<(), HttpError> {
     match parts.uri.query() {
         None | Some("") => Ok(()),
         Some(query) => Err(Error::field("query", "no query parameters", query).into()),

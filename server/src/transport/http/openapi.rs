@@ -79,20 +79,14 @@ pub(super) fn document() -> Value {
             "description": "Guidance for spacecraft rendezvous. The messages of `vbar.v1` as \
                 canonical proto3 JSON: field names in lowerCamelCase (snake_case is accepted), \
                 64-bit integers as strings, enum values by name. Unknown fields are refused. The \
-                header `Request-Timeout-Ms` gives a deadline; `X-Request-Id` is echoed.",
+                header `Request-Timeout-Ms` gives a deadline in milliseconds (a call that cannot keep it \
+                is answered with 504); `X-Request-Id` is echoed.",
             "license": { "name": "Apache-2.0", "identifier": "Apache-2.0" },
         },
         "paths": paths,
         "components": {
             "schemas": schemas.by_name,
             "parameters": {
-                "timeout": {
-                    "name": "Request-Timeout-Ms",
-                    "in": "header",
-                    "required": false,
-                    "description": "The caller's deadline in milliseconds.",
-                    "schema": { "type": "string", "pattern": "^[0-9]{1,9}$" },
-                },
                 "id": {
                     "name": "id",
                     "in": "path",
@@ -109,7 +103,7 @@ fn operation(route: &Route, schemas: &mut Schemas) -> Value {
     let (service, rpc) = route.rpc.rsplit_once('.').unwrap_or_default();
     let service = DESCRIPTORS.get_service_by_name(service).expect("it is in the contract");
     let rpc = service.methods().find(|m| m.name() == rpc).expect("it is in the contract");
-    let mut parameters = vec![json!({ "$ref": "#/components/parameters/timeout" })];
+    let mut parameters = Vec::new();
     if route.path.contains("{id}") {
         parameters.push(json!({ "$ref": "#/components/parameters/id" }));
     }
