@@ -12,8 +12,7 @@ use prost_reflect::DescriptorPool;
 pub use strict::{StrictCodec, UnknownField, find_unknown_field};
 
 /// The serialised `FileDescriptorSet` of every file, with comments.
-pub const FILE_DESCRIPTOR_SET: &[u8] =
-    include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Descriptors of every message, for canonical JSON and for reflection.
 pub static DESCRIPTORS: LazyLock<DescriptorPool> = LazyLock::new(|| {
