@@ -45,7 +45,7 @@ pub(super) fn trajectory(
     let mut legend = scheme_legend(campaigns, Mark::Line);
     legend.push(("capture point", Mark::Dashed, INK));
     legend.push(("cone", Mark::Patch, GREEN));
-    legend.push(("tube", Mark::Patch, SKY));
+    legend.push(("tube of the first plan", Mark::Patch, SKY));
     page(path, (1180, 600), &title, &legend, |area| {
         let halves = area.split_evenly((1, 2));
         let Some(flight) = campaigns.first().and_then(|c| c.flights.first()) else {
