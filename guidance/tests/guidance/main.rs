@@ -3,3 +3,4 @@
 #![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
 
 mod golden;
+mod laws;

@@ -144,10 +144,23 @@ impl Flight {
         }
     }
 
+    /// The samples at which the problem imposes its state constraints.
+    fn constrained_samples(&self) -> &[Sample] {
+        let free = self.arrived() && !self.model.constrained_at_arrival;
+        &self.samples[..self.samples.len() - usize::from(free)]
+    }
+
+    /// Arrived outside the state constraints, which a problem may allow.
+    #[must_use]
+    pub fn arrived_outside(&self) -> bool {
+        let last = self.samples.last().and_then(|sample| sample.margin_nd);
+        self.arrived() && last.is_some_and(|margin| margin < -VIOLATION_TOLERANCE_ND)
+    }
+
     /// Least margin to the state constraints over all samples, normalised; `None` without any.
     #[must_use]
     pub fn worst_margin_nd(&self) -> Option<f64> {
-        self.samples.iter().filter_map(|sample| sample.margin_nd).reduce(f64::min)
+        self.constrained_samples().iter().filter_map(|sample| sample.margin_nd).reduce(f64::min)
     }
 
     /// Least margin to the input constraints over all commands, normalised.
@@ -160,8 +173,9 @@ impl Flight {
     #[must_use]
     pub fn first_violation(&self) -> Option<usize> {
         let outside = |margin: f64| margin < -VIOLATION_TOLERANCE_ND;
-        (0..self.samples.len()).find(|&k| {
-            self.samples[k].margin_nd.is_some_and(outside)
+        let samples = self.constrained_samples();
+        (0..samples.len()).find(|&k| {
+            samples[k].margin_nd.is_some_and(outside)
                 || self.steps.get(k).is_some_and(|step| outside(step.input_margin_nd))
         })
     }

@@ -28,6 +28,9 @@ pub(crate) struct Model {
     pub disturbance: DisturbanceModel,
     /// Most steps of a run.
     pub steps_max: usize,
+    /// The state constraints hold at the arrival too. With the reference itself as terminal point
+    /// the problem imposes them before the arrival only [Quartullo2025b, eq. 9].
+    pub constrained_at_arrival: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -143,7 +146,17 @@ impl Model {
         };
         match kind {
             Some((kind, disturbance)) if faults.is_empty() => {
-                Ok(Self { kind, disturbance, steps_max: steps as usize })
+                let projection = match inner.terminal_point() {
+                    v1::TerminalPoint::Projection => true,
+                    v1::TerminalPoint::Reference => false,
+                    v1::TerminalPoint::Unspecified => matches!(kind, Kind::Hill(_)),
+                };
+                Ok(Self {
+                    kind,
+                    disturbance,
+                    steps_max: steps as usize,
+                    constrained_at_arrival: projection,
+                })
             }
             _ => Err(faults),
         }

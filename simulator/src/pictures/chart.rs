@@ -16,7 +16,10 @@ use plotters::{
         Cartesian2d, ChartBuilder, Circle, DashedLineSeries, DrawingArea, IntoDrawingArea as _,
         LineSeries, PathElement, Polygon, RGBColor, SVGBackend, Text,
     },
-    style::{Color as _, IntoFont as _, ShapeStyle, TextStyle, WHITE},
+    style::{
+        Color as _, IntoFont as _, ShapeStyle, TextStyle, WHITE,
+        text_anchor::{HPos, Pos, VPos},
+    },
 };
 
 use super::PictureError;
@@ -123,7 +126,11 @@ pub(super) fn panel<'a, 'b>(
     axes: &Axes,
 ) -> Result<Panel<'a, 'b>, PictureError> {
     let mut builder = ChartBuilder::on(area);
-    builder.margin(MARGIN).x_label_area_size(BELOW).y_label_area_size(LEFT);
+    builder
+        .margin(MARGIN)
+        .margin_right(2 * MARGIN)
+        .x_label_area_size(BELOW)
+        .y_label_area_size(LEFT);
     if !axes.title.is_empty() {
         builder.caption(axes.title.clone(), font(18.0));
     }
@@ -174,7 +181,7 @@ pub(super) fn unnumbered_panel<'a, 'b>(
 pub(super) fn equal(area: &Area<'_>, x: Range<f64>, y: Range<f64>) -> (Range<f64>, Range<f64>) {
     let (width, height) = area.dim_in_pixel();
     let inner = |outer: u32, used: i32| f64::from(outer) - f64::from(used + 2 * MARGIN);
-    let (width, height) = (inner(width, LEFT), inner(height, BELOW));
+    let (width, height) = (inner(width, LEFT + MARGIN), inner(height, BELOW));
     let scale = ((x.end - x.start) / width).max((y.end - y.start) / height);
     let around = |range: Range<f64>, pixels: f64| {
         let (middle, half) = (0.5 * (range.start + range.end), 0.5 * scale * pixels);
@@ -199,7 +206,7 @@ pub(super) fn range(values: impl IntoIterator<Item = f64>) -> Range<f64> {
 /// The same, from zero up: for quantities that are never negative.
 pub(super) fn from_zero(values: impl IntoIterator<Item = f64>) -> Range<f64> {
     let largest = values.into_iter().filter(|value| value.is_finite()).fold(0.0, f64::max);
-    0.0..if largest > 0.0 { 1.08 * largest } else { 1.0 }
+    0.0..if largest > 0.0 { 1.1 * largest } else { 1.0 }
 }
 
 /// "1 run", "2 runs".
@@ -265,13 +272,14 @@ pub(super) fn shape(
     Ok(())
 }
 
-/// Text inside a panel, its left end at `place`.
+/// Text centred above a place in a panel.
 pub(super) fn note(
     chart: &mut Panel<'_, '_>,
     place: (f64, f64),
     text: String,
 ) -> Result<(), PictureError> {
-    chart.draw_series([Text::new(text, place, font(16.0))])?;
+    let style = font(16.0).pos(Pos::new(HPos::Center, VPos::Bottom));
+    chart.draw_series([Text::new(text, place, style)])?;
     Ok(())
 }
 

@@ -17,7 +17,7 @@ use plotters::{drawing::DrawingAreaErrorKind, style::RGBColor};
 use vbar_proto::v1::VariableHorizonScheme as Scheme;
 
 use crate::{
-    campaign::Campaign,
+    campaign::{Campaign, Flight},
     mission::{Mission, model::Kind},
     report::Report,
 };
@@ -69,7 +69,8 @@ pub fn draw(mission: &Mission, report: &Report, out: &Path) -> Result<Vec<PathBu
     }
     written.push(series::inputs(&file("inputs"), mission, main)?);
     written.push(series::cost_and_horizon(&file("cost_horizon"), mission, &detail[0])?);
-    if report.campaigns.len() > 1 {
+    let arrives = |campaign: &Campaign| campaign.flights.iter().any(Flight::arrived);
+    if report.campaigns.iter().filter(|campaign| arrives(campaign)).count() > 1 {
         written.push(series::boxes(&file("schemes"), mission, &report.campaigns)?);
     }
     if !report.sweep.is_empty() {
@@ -90,12 +91,15 @@ fn appearance(scheme: Scheme) -> (&'static str, RGBColor) {
 }
 
 /// One legend entry a scheme.
-fn scheme_legend(campaigns: &[Campaign], mark: chart::Mark) -> Vec<chart::Entry> {
+fn scheme_legend<'a>(
+    campaigns: impl IntoIterator<Item = &'a Campaign>,
+    mark: chart::Mark,
+) -> Vec<chart::Entry> {
     let entry = |campaign: &Campaign| {
         let (name, color) = appearance(campaign.scheme);
         (name, mark, color)
     };
-    campaigns.iter().map(entry).collect()
+    campaigns.into_iter().map(entry).collect()
 }
 
 #[cfg(test)]
@@ -109,7 +113,7 @@ mod tests {
     use super::*;
     use crate::{
         campaign::{
-            Flight, SweepPoint,
+            SweepPoint,
             flight::{Outcome, Sample, Step},
             vehicle,
         },

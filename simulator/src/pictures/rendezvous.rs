@@ -45,7 +45,7 @@ pub(super) fn trajectory(
     let mut legend = scheme_legend(campaigns, Mark::Line);
     legend.push(("capture point", Mark::Dashed, INK));
     legend.push(("cone", Mark::Patch, GREEN));
-    legend.push(("tube", Mark::Patch, SKY));
+    legend.push(("tube of the first plan", Mark::Patch, SKY));
     page(path, (1180, 600), &title, &legend, |area| {
         let halves = area.split_evenly((1, 2));
         let Some(flight) = campaigns.first().and_then(|c| c.flights.first()) else {
@@ -245,8 +245,12 @@ fn flat(state: &[f64]) -> (f64, f64) {
     (state[1], state[0])
 }
 
+/// The path in the plane; of a run that never arrives, only up to its first violation.
 fn in_plane(flight: &Flight) -> Points {
-    flight.samples.iter().map(|sample| flat(&sample.state)).collect()
+    let all = flight.samples.len();
+    let shown =
+        if flight.arrived() { all } else { flight.first_violation().map_or(all, |k| k + 1) };
+    flight.samples[..shown].iter().map(|sample| flat(&sample.state)).collect()
 }
 
 fn capture_path(flight: &Flight) -> Points {

@@ -113,23 +113,29 @@ pub(super) fn boxes(
     mission: &Mission,
     campaigns: &[Campaign],
 ) -> Result<PathBuf, PictureError> {
-    let metres = campaigns[0].flights.first().is_some_and(|f| f.position_unit_m().is_some());
+    // A scheme that never arrives has no box.
+    let arrives = |campaign: &&Campaign| campaign.flights.iter().any(Flight::arrived);
+    let campaigns: Vec<&Campaign> = campaigns.iter().filter(arrives).collect();
+    let Some(first) = campaigns.first() else {
+        return Err(PictureError::Drawing("no run of any scheme arrived".into()));
+    };
+    let metres = first.flights.first().is_some_and(|f| f.position_unit_m().is_some());
     let distance = if metres { "final distance [m]" } else { "final norm" };
-    let runs = campaigns[0].flights.len();
-    let title = format!("{}: {} of each scheme", mission.name, counted(runs));
-    let legend = scheme_legend(campaigns, Mark::Patch);
+    let runs = first.flights.len();
+    let title = format!("{}: {} of each scheme, medians above", mission.name, counted(runs));
+    let legend = scheme_legend(campaigns.iter().copied(), Mark::Patch);
     page(path, (960, 440), &title, &legend, |area| {
         let columns = area.split_evenly((1, 3));
-        box_panel(&columns[0], distance, campaigns, &Flight::final_distance)?;
-        box_panel(&columns[1], "fuel, sum of |u|", campaigns, &Flight::fuel)?;
-        box_panel(&columns[2], "completion time, steps", campaigns, &|f| f.steps.len() as f64)
+        box_panel(&columns[0], distance, &campaigns, &Flight::final_distance)?;
+        box_panel(&columns[1], "fuel, sum of |u|", &campaigns, &Flight::fuel)?;
+        box_panel(&columns[2], "completion time, steps", &campaigns, &|f| f.steps.len() as f64)
     })
 }
 
 fn box_panel(
     area: &Area<'_>,
     title: &str,
-    campaigns: &[Campaign],
+    campaigns: &[&Campaign],
     value: &dyn Fn(&Flight) -> f64,
 ) -> Result<(), PictureError> {
     let statistics: Vec<Option<Statistics>> = campaigns
@@ -140,7 +146,7 @@ fn box_panel(
         })
         .collect();
     let axes = Axes {
-        x: 0.0..campaigns.len() as f64 + 0.2,
+        x: 0.0..campaigns.len() as f64,
         y: from_zero(statistics.iter().flatten().map(|s| s.max)),
         x_name: "",
         y_name: "",
@@ -176,7 +182,7 @@ fn draw_box(
         (vec![(x - half, s.median), (x + half, s.median)], thick),
     ];
     chart.draw_series(strokes.map(|(points, style)| PathElement::new(points, style)))?;
-    note(chart, (x + half + 0.02, s.median), format!("{:.2}", s.median))
+    note(chart, (x, s.max), format!("{:.2}", s.median))
 }
 
 /// Mean fuel and duration against the fuel weight [Quartullo2025a, fig. 12].

@@ -123,6 +123,9 @@ pub struct Summary {
     pub infeasible: usize,
     /// Runs with any sample or command outside its constraints.
     pub constraint_violations: usize,
+    /// Runs that arrived outside the state constraints; a violation only where the problem imposes
+    /// them at the arrival.
+    pub arrived_outside: usize,
     /// Mean step of the first violation, over the runs that have one.
     pub first_violation_step: Option<f64>,
     /// Least margin to the state constraints over all runs, normalised; none without any.
@@ -171,6 +174,7 @@ impl Summary {
                 .filter(|flight| matches!(flight.outcome, Outcome::Infeasible(_)))
                 .count(),
             constraint_violations: first.len(),
+            arrived_outside: flights.iter().filter(|flight| flight.arrived_outside()).count(),
             first_violation_step: Statistics::of(first).map(|s| s.mean),
             worst_margin: flights.iter().filter_map(Flight::worst_margin_nd).reduce(f64::min),
             worst_input_margin: flights
@@ -208,6 +212,7 @@ impl Summary {
             put(name, statistics.json());
         }
         put("constraint_violations", self.constraint_violations.into());
+        put("arrived_outside", self.arrived_outside.into());
         put("first_violation_step", self.first_violation_step.into());
         put("worst_margin", self.worst_margin.into());
         put("worst_input_margin", self.worst_input_margin.into());

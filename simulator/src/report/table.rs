@@ -92,7 +92,10 @@ fn margins(summary: &Summary) -> String {
     let state = summary.worst_margin.map(|margin| format!("{margin:.3e}"));
     let metres = summary.worst_margin_m.map(|margin| format!(" ({margin:.3} m)"));
     let input = summary.worst_input_margin.map(|margin| format!(", of the input {margin:.3e}"));
-    let parts = [state.or(Some("none".into())), metres, input];
+    let outside = (summary.arrived_outside > summary.constraint_violations).then(|| {
+        format!("; arrivals outside, which the problem allows, {}", summary.arrived_outside)
+    });
+    let parts = [state.or(Some("none".into())), metres, input, outside];
     parts.into_iter().flatten().collect()
 }
 

@@ -1,0 +1,475 @@
+//! Laws of the closed loop on random missions, and what a certificate refuses.
+
+use nalgebra::{DMatrix, DVector, Vector3};
+use proptest::prelude::*;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use vbar_guidance::{
+    Budget, Interruption,
+    control::{
+        Claim, Controller, Failure, StepError,
+        variable_horizon::{
+            Artifact, Branch, GainChoice, HillPlant, HorizonSearch, MeasuredState, Measurement,
+            PlanOutcome, Plant, Problem, Scheme, State, Step, TerminalFallback, TerminalPoint,
+            VariableHorizon, Verdict, Weights, plan,
+        },
+    },
+    dynamics::HillScaling,
+    mission::{BodyMotion, DisturbanceSet, DockingCone, TargetMotion},
+    program::{Clarabel, DualSimplex},
+    units::{Acceleration, Angle},
+};
+
+/// A random rendezvous with a spinning target in low orbit, in the ranges of
+/// [Quartullo2025a, sec. V.A].
+#[derive(Debug, Clone)]
+struct Mission {
+    acceleration_max: f64,
+    spin_period_s: f64,
+    distance_m: f64,
+    off_axis: (f64, f64),
+    fuel: f64,
+    scheme: Scheme,
+    reference_fallback: bool,
+    seed: u64,
+    law: DisturbanceLaw,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum DisturbanceLaw {
+    Uniform,
+    Vertices,
+    ConstantVertex,
+    None,
+}
+
+const MEAN_MOTION_RAD_S: f64 = 0.001_038_128_881_280_235_6;
+
+fn missions() -> impl Strategy<Value = Mission> {
+    let law = prop_oneof![
+        Just(DisturbanceLaw::Uniform),
+        Just(DisturbanceLaw::Vertices),
+        Just(DisturbanceLaw::ConstantVertex),
+        Just(DisturbanceLaw::None),
+    ];
+    let scheme = prop_oneof![
+        3 => Just(Scheme::AdaptiveTerminal),
+        1 => Just(Scheme::FixedTerminal),
+        1 => Just(Scheme::TubeOptimalControl),
+    ];
+    let geometry = (0.005..0.05, 300.0..600.0, 20.0..85.0, (-0.3..0.3, -0.3..0.3));
+    (geometry, 0.0..5.8, scheme, any::<bool>(), any::<u64>(), law).prop_map(
+        |(
+            (acceleration_max, spin_period_s, distance_m, off_axis),
+            fuel,
+            scheme,
+            free,
+            seed,
+            law,
+        )| {
+            Mission {
+                acceleration_max,
+                spin_period_s,
+                distance_m,
+                off_axis,
+                fuel,
+                scheme,
+                reference_fallback: free,
+                seed,
+                law,
+            }
+        },
+    )
+}
+
+impl Mission {
+    fn problem(&self) -> Problem {
+        let rate = std::f64::consts::TAU / self.spin_period_s;
+        let port = Vector3::new(-1.5, 0.0, 0.0);
+        // [Quartullo2025b]: the capture point lies before the port, inside every tightened cone.
+        let (capture, point, fallback) = if self.reference_fallback {
+            (port * 4.0, TerminalPoint::Reference, TerminalFallback::FreeHorizon)
+        } else {
+            (port, TerminalPoint::Projection, TerminalFallback::PreviousHorizon)
+        };
+        Problem {
+            plant: Plant::Hill(HillPlant {
+                mean_motion_rad_s: MEAN_MOTION_RAD_S,
+                sample_angle: Angle::from_radians(std::f64::consts::TAU / 512.0),
+                acceleration_max: Acceleration::from_m_s2(self.acceleration_max),
+                mass: None,
+                cone: Some(DockingCone {
+                    half_angle: Angle::from_degrees(30.0),
+                    face_roll: Angle::from_radians(0.0),
+                }),
+                target: TargetMotion::Rigid {
+                    capture_point_m: capture,
+                    docking_port_m: port,
+                    body: BodyMotion::Spin(Vector3::z() * rate),
+                },
+                disturbance: match self.law {
+                    DisturbanceLaw::None => DisturbanceSet::None,
+                    _ => DisturbanceSet::Box(vec![1e-6, 1e-6, 1e-6, 5e-4, 5e-4, 5e-4]),
+                },
+            }),
+            scheme: self.scheme,
+            gain: GainChoice::Poles(vec![0.6, 0.6, 0.6, 0.5, 0.5, 0.5]),
+            weights: Weights { fuel: self.fuel, tracking: 0.0 },
+            search: HorizonSearch::Local,
+            horizon_max: 60,
+            horizon_guess: None,
+            terminal_point: point,
+            fallback,
+            steps_max: 300,
+            fixed_terminal_terms: None,
+        }
+    }
+
+    fn scaling(&self) -> HillScaling {
+        HillScaling::new(MEAN_MOTION_RAD_S, self.acceleration_max)
+    }
+
+    fn start(&self) -> DVector<f64> {
+        let along = self.distance_m;
+        let position = [-along, along * self.off_axis.0, along * self.off_axis.1];
+        let unit = self.scaling().position_unit_m;
+        DVector::from_iterator(6, position.map(|p| p / unit).into_iter().chain([0.0; 3]))
+    }
+
+    fn measured(&self, x: &DVector<f64>) -> Measurement {
+        let state = MeasuredState::Relative(self.scaling().physical(x.as_slice()));
+        Measurement { state, elapsed: None }
+    }
+}
+
+fn draw(generators: &DMatrix<f64>, law: DisturbanceLaw, random: &mut ChaCha8Rng) -> DVector<f64> {
+    let coefficient = |random: &mut ChaCha8Rng| match law {
+        DisturbanceLaw::Uniform => random.random_range(-1.0..=1.0),
+        DisturbanceLaw::Vertices => {
+            if random.random::<bool>() {
+                1.0
+            } else {
+                -1.0
+            }
+        }
+        DisturbanceLaw::ConstantVertex => 1.0,
+        DisturbanceLaw::None => 0.0,
+    };
+    let xi = DVector::from_fn(generators.ncols(), |_, _| coefficient(random));
+    generators * xi
+}
+
+fn step(mission: &Mission, artifact: &Artifact, state: &State, x: &DVector<f64>) -> Step {
+    VariableHorizon::step(artifact, state, &mission.measured(x), Budget::UNLIMITED)
+        .unwrap_or_else(|error| panic!("{mission:?}: {error:?}"))
+}
+
+/// Flies a mission and checks, at every step, what the papers promise.
+fn fly(mission: &Mission) -> Result<bool, TestCaseError> {
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let summary = artifact.summary();
+    let mut random = ChaCha8Rng::seed_from_u64(mission.seed);
+    let mut x = mission.start();
+    let mut state = VariableHorizon::start(&artifact);
+    let mut previous_cost = f64::INFINITY;
+    for k in 0..300 {
+        let margin = artifact.state_margins(k, &x).into_iter().fold(f64::INFINITY, f64::min);
+        prop_assert!(k == 0 || margin >= -1e-9, "step {}: outside the cone by {:e}", k, -margin);
+        let answer = step(mission, &artifact, &state, &x);
+        prop_assert_eq!(answer.diagnostics.general_solver_calls, 0, "step {}: Clarabel", k);
+        let command = match answer.verdict {
+            Verdict::Infeasible(reason) => {
+                prop_assert_eq!(k, 0, "infeasible in flight: {:?}", reason);
+                return Ok(false);
+            }
+            Verdict::Arrived(arrival) => {
+                prop_assert!(arrival.inside_guaranteed_set, "outside the final set");
+                return Ok(true);
+            }
+            Verdict::Command(command) => command,
+        };
+        let certificate = answer.certificate.unwrap();
+        prop_assert!(certificate.passed, "step {}: {:?}", k, certificate);
+        prop_assert!(command.input.amax() <= 1.0 + 1e-9, "step {}: input {}", k, command.input);
+        if let Some(w) = answer.disturbance {
+            prop_assert!(!w.outside_assumed_set, "step {}: {:?}", k, w);
+        }
+        if mission.scheme == Scheme::AdaptiveTerminal {
+            let cost = answer.diagnostics.cost;
+            let least = previous_cost - summary.lambda_bar;
+            prop_assert!(cost <= least + 1e-6 * (1.0 + cost.abs()), "step {}: cost {}", k, cost);
+            previous_cost = cost;
+        }
+        let w = draw(&summary.disturbance_generators, mission.law, &mut random);
+        x = &summary.a * &x + &summary.b * &command.input + w;
+        // What travels must survive the journey.
+        state = State::from_bytes(&answer.next.to_bytes()).unwrap();
+        prop_assert_eq!(&state, &answer.next);
+    }
+    Err(TestCaseError::fail("no arrival within 300 steps"))
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 150, ..ProptestConfig::default() })]
+
+    /// Recursive feasibility, decrease by lambda_bar, no violated constraint, final set: for any
+    /// disturbance in W. [Quartullo2025a, Proposition 1; Quartullo2025b, Theorems 1 and 2]
+    #[test]
+    fn closed_loop_keeps_the_papers_promises(mission in missions()) {
+        fly(&mission)?;
+    }
+
+    /// The fast path against Clarabel on programs nobody chose.
+    #[test]
+    fn simplex_agrees_with_clarabel(mission in missions(), horizon in 1usize..45) {
+        let artifact = Artifact::prepare(&mission.problem()).unwrap();
+        let x = mission.start();
+        let fast = artifact.solve_horizon(0, &x, horizon, &mut DualSimplex::default()).unwrap();
+        let general = artifact.solve_horizon(0, &x, horizon, &mut Clarabel);
+        match (fast.cost, general.map(|answer| answer.cost)) {
+            (Some(fast), Ok(Some(general))) => {
+                prop_assert!((fast - general).abs() <= 1e-6 * (1.0 + fast), "{} {}", fast, general);
+            }
+            (None, Ok(None) | Err(_)) => {}
+            other => prop_assert!(false, "{:?}", other),
+        }
+    }
+
+    /// No result depends on what the solver did before.
+    #[test]
+    fn solver_keeps_no_state(mission in missions(), first in 1usize..45, second in 1usize..45) {
+        let artifact = Artifact::prepare(&mission.problem()).unwrap();
+        let x = mission.start();
+        let mut used = DualSimplex::default();
+        let _ = artifact.solve_horizon(0, &x, first, &mut used).unwrap();
+        let after = artifact.solve_horizon(0, &x, second, &mut used).unwrap();
+        let fresh = artifact.solve_horizon(0, &x, second, &mut DualSimplex::default()).unwrap();
+        prop_assert_eq!(after, fresh);
+    }
+
+    /// Equal problems give equal bytes, and artifacts survive storage.
+    #[test]
+    fn artifact_survives_its_bytes(mission in missions()) {
+        let artifact = Artifact::prepare(&mission.problem()).unwrap();
+        let bytes = artifact.to_bytes();
+        prop_assert_eq!(&bytes, &Artifact::prepare(&mission.problem()).unwrap().to_bytes());
+        let back = Artifact::from_bytes(&bytes).unwrap();
+        prop_assert_eq!(back.problem().canonical_bytes(), mission.problem().canonical_bytes());
+        prop_assert_eq!(back, artifact);
+    }
+
+    /// Bytes from anywhere are refused or read, never a crash.
+    #[test]
+    fn decoding_noise_never_panics(mission in missions(), at in any::<prop::sample::Index>(), value: u8) {
+        let mut bytes = Artifact::prepare(&mission.problem()).unwrap().to_bytes();
+        let index = at.index(bytes.len());
+        bytes[index] = value;
+        let _ = Artifact::from_bytes(&bytes);
+        let _ = State::from_bytes(&bytes);
+    }
+}
+
+fn example(scheme: Scheme, law: DisturbanceLaw) -> Mission {
+    Mission {
+        acceleration_max: 0.02,
+        spin_period_s: 500.0,
+        distance_m: 40.0,
+        off_axis: (0.1, 0.05),
+        fuel: 5.0,
+        scheme,
+        reference_fallback: false,
+        seed: 1,
+        law,
+    }
+}
+
+#[test]
+fn every_scheme_arrives() {
+    for scheme in [Scheme::AdaptiveTerminal, Scheme::FixedTerminal, Scheme::TubeOptimalControl] {
+        for law in [DisturbanceLaw::Uniform, DisturbanceLaw::ConstantVertex, DisturbanceLaw::None] {
+            assert!(fly(&example(scheme, law)).unwrap(), "{scheme:?} {law:?} must be feasible");
+        }
+    }
+}
+
+#[test]
+fn minimum_time_horizon_falls_every_step() {
+    // [Quartullo2025b, Corollary 1]
+    let mission =
+        Mission { fuel: 0.0, ..example(Scheme::AdaptiveTerminal, DisturbanceLaw::Vertices) };
+    assert!(fly(&mission).unwrap());
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    assert_eq!(artifact.summary().lambda_bar, 1.0);
+}
+
+/// Runs out of budget at the n-th question.
+fn interrupted_step(
+    mission: &Mission,
+    artifact: &Artifact,
+    state: &State,
+    x: &DVector<f64>,
+    questions: usize,
+    kind: Interruption,
+) -> Result<Step, StepError> {
+    let asked = std::sync::atomic::AtomicUsize::new(0);
+    let ask = || {
+        let before = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        (before >= questions).then_some(kind)
+    };
+    VariableHorizon::step(artifact, state, &mission.measured(x), Budget::new(&ask))
+}
+
+#[test]
+fn deadline_is_answered_with_what_is_certified() {
+    let mission = example(Scheme::AdaptiveTerminal, DisturbanceLaw::Uniform);
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let summary = artifact.summary();
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let start = VariableHorizon::start(&artifact);
+    let x = mission.start();
+    let none = interrupted_step(&mission, &artifact, &start, &x, 0, Interruption::Deadline);
+    let expected = StepError::Failure(Failure::Interrupted(Interruption::Deadline));
+    assert_eq!(none.unwrap_err(), expected);
+    // From the second step on, the previous plan's tail is always there: a whole mission without
+    // a single optimisation after the first.
+    let (mut x, mut state) = (x, start);
+    for k in 0..300 {
+        let questions = if k == 0 { usize::MAX } else { 0 };
+        let kind = Interruption::Deadline;
+        let answer = interrupted_step(&mission, &artifact, &state, &x, questions, kind).unwrap();
+        let command = match answer.verdict {
+            Verdict::Arrived(arrival) => {
+                assert!(arrival.inside_guaranteed_set);
+                assert!(k > 3);
+                return;
+            }
+            Verdict::Command(command) => command,
+            Verdict::Infeasible(reason) => panic!("step {k}: {reason:?}"),
+        };
+        if k > 0 {
+            assert_eq!(answer.diagnostics.branch, Branch::PreviousPlanTail);
+            let certificate = answer.certificate.unwrap();
+            assert!(certificate.passed && certificate.claim == Claim::PreviousPlanTail);
+        }
+        let w = draw(&summary.disturbance_generators, mission.law, &mut random);
+        x = &summary.a * &x + &summary.b * &command.input + w;
+        assert!(artifact.state_margins(k + 1, &x).iter().all(|&margin| margin >= -1e-9));
+        state = answer.next;
+    }
+    panic!("no arrival");
+}
+
+#[test]
+fn interruption_at_any_moment_is_an_answer_or_an_error_never_a_wrong_one() {
+    let mission = example(Scheme::AdaptiveTerminal, DisturbanceLaw::Uniform);
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let start = VariableHorizon::start(&artifact);
+    let x = mission.start();
+    let full = step(&mission, &artifact, &start, &x);
+    for questions in 0..200 {
+        let kind = Interruption::Deadline;
+        match interrupted_step(&mission, &artifact, &start, &x, questions, kind) {
+            Err(error) => assert!(matches!(error, StepError::Failure(Failure::Interrupted(_)))),
+            Ok(answer) => {
+                let certificate = answer.certificate.as_ref().unwrap();
+                assert!(certificate.passed);
+                assert!(answer == full || certificate.claim == Claim::Feasible, "{questions}");
+            }
+        }
+        let cancelled =
+            interrupted_step(&mission, &artifact, &start, &x, questions, Interruption::Cancelled);
+        assert!(cancelled.is_err() || cancelled.unwrap() == full);
+    }
+}
+
+#[test]
+fn disturbance_outside_the_set_is_said() {
+    let mission = example(Scheme::AdaptiveTerminal, DisturbanceLaw::Uniform);
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let summary = artifact.summary();
+    let x = mission.start();
+    let first = step(&mission, &artifact, &VariableHorizon::start(&artifact), &x);
+    let Verdict::Command(command) = &first.verdict else { panic!("{first:?}") };
+    let nominal = &summary.a * &x + &summary.b * &command.input;
+    for (factor, outside) in [(0.999, false), (1.001, true)] {
+        let w = summary.disturbance_generators.column(4) * factor;
+        let answer = step(&mission, &artifact, &first.next, &(&nominal + w));
+        let realised = answer.disturbance.unwrap();
+        assert_eq!(realised.outside_assumed_set, outside, "{realised:?}");
+        assert!((realised.gauge.unwrap() - factor).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn start_outside_the_cone_is_refused_by_face() {
+    let mission =
+        Mission { off_axis: (0.9, 0.0), ..example(Scheme::AdaptiveTerminal, DisturbanceLaw::None) };
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let answer = step(&mission, &artifact, &VariableHorizon::start(&artifact), &mission.start());
+    let Verdict::Infeasible(reason) = answer.verdict else { panic!("{answer:?}") };
+    assert!(reason.reason.contains("row"), "{reason:?}");
+    assert!(reason.relaxations[0].amount > 0.0);
+}
+
+#[test]
+fn least_relaxation_is_the_least() {
+    // 5 mm/s^2 from 85 m with a fast spin: nothing reaches in time. Relaxed by what is named, the
+    // terminal constraint can be met; relaxed by a little less, it cannot.
+    let mission = Mission {
+        acceleration_max: 0.005,
+        spin_period_s: 300.0,
+        distance_m: 85.0,
+        ..example(Scheme::AdaptiveTerminal, DisturbanceLaw::Uniform)
+    };
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let answer = step(&mission, &artifact, &VariableHorizon::start(&artifact), &mission.start());
+    let Verdict::Infeasible(reason) = answer.verdict else { panic!("must be infeasible") };
+    assert!(reason.all_horizons_proved && !reason.rows.is_empty());
+    let total: f64 = reason.rows.iter().map(|row| row.weight).sum();
+    assert!(total > 0.5 && total <= 1.0 + 1e-12, "{reason:?}");
+    assert!(!reason.relaxations.is_empty(), "{reason:?}");
+    assert!(reason.relaxations.iter().all(|r| r.amount > 0.0), "{reason:?}");
+}
+
+#[test]
+fn plan_and_first_step_agree() {
+    let mission = example(Scheme::TubeOptimalControl, DisturbanceLaw::Uniform);
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let x = mission.start();
+    let outcome = plan(&artifact, &mission.measured(&x), Budget::UNLIMITED).unwrap();
+    let PlanOutcome::Plan(plan) = outcome else { panic!("{outcome:?}") };
+    let first = step(&mission, &artifact, &VariableHorizon::start(&artifact), &x);
+    let Verdict::Command(command) = first.verdict else { panic!("no command") };
+    assert_eq!(plan.commands[0], command);
+    assert_eq!(plan.commands.len(), plan.trajectory.horizon());
+    let tube = plan.tube.unwrap();
+    assert_eq!(tube.half_widths.nrows(), plan.trajectory.horizon() + 1);
+    assert!(plan.commands.iter().rev().skip(1).all(|command| !command.last));
+}
+
+#[test]
+fn state_of_another_controller_is_refused() {
+    let mission = example(Scheme::AdaptiveTerminal, DisturbanceLaw::Uniform);
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let x = mission.start();
+    let first = step(&mission, &artifact, &VariableHorizon::start(&artifact), &x);
+    let short = Problem { horizon_max: 3, ..mission.problem() };
+    let other = Artifact::prepare(&short).unwrap();
+    let answer =
+        VariableHorizon::step(&other, &first.next, &mission.measured(&x), Budget::UNLIMITED);
+    assert!(matches!(answer, Err(StepError::State(_))), "{answer:?}");
+}
+
+#[test]
+fn late_measurement_is_refused_by_field() {
+    let mission = example(Scheme::AdaptiveTerminal, DisturbanceLaw::Uniform);
+    let artifact = Artifact::prepare(&mission.problem()).unwrap();
+    let late = Measurement {
+        elapsed: Some(vbar_guidance::units::Seconds::from_seconds(1.0)),
+        ..mission.measured(&mission.start())
+    };
+    let start = VariableHorizon::start(&artifact);
+    let error = VariableHorizon::step(&artifact, &start, &late, Budget::UNLIMITED).unwrap_err();
+    let StepError::Measurement(faults) = error else { panic!("{error:?}") };
+    assert_eq!(faults[0].field, "elapsed_s");
+}
