@@ -1,0 +1,407 @@
+//! Configuration: flags over environment over file over defaults.
+//!
+//! Each source is read into [`Settings`], where everything is optional; [`Settings::over`] stacks
+//! them and [`Settings::apply`] lays the stack on the defaults. A [`Config`] names all its faults
+//! at once, and a node does not start with any.
+
+use std::{fmt, net::SocketAddr, path::PathBuf, thread, time::Duration};
+
+use serde::Deserialize;
+
+use crate::wire::Limits;
+
+/// Everything a node needs to know.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Config {
+    /// Where to listen; port 0 takes any free one.
+    pub listen: SocketAddr,
+    /// Listen beyond loopback although there is no authentication.
+    pub allow_insecure_listen: bool,
+    /// Computations at once.
+    pub compute_threads: usize,
+    /// How long a call may wait for a compute thread before it is told to come back.
+    pub compute_wait: Duration,
+    /// How many calls may wait at once.
+    pub compute_waiting_max: usize,
+    /// Longest computation, whatever the caller's deadline.
+    pub computation_time_max: Duration,
+    /// Largest request.
+    pub request_bytes_max: usize,
+    /// Open connections.
+    pub connections_max: usize,
+    /// Calls at once on one HTTP/2 connection.
+    pub streams_max: u32,
+    /// How long the head, and then the body, of a request may take to arrive.
+    pub receive_time_max: Duration,
+    /// How long calls under way may take to finish at shutdown.
+    pub shutdown_grace: Duration,
+    /// Where artifacts are kept.
+    pub store: StoreLocation,
+    /// Decoded artifacts kept in memory, bytes.
+    pub cache_bytes_max: usize,
+    /// Limits on what a request may ask for.
+    pub limits: Limits,
+}
+
+/// Where artifacts are kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum StoreLocation {
+    /// In memory, up to so many bytes; gone when the process ends.
+    Memory {
+        /// Most bytes.
+        bytes_max: usize,
+    },
+    /// In a directory.
+    Directory(PathBuf),
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+            allow_insecure_listen: false,
+            compute_threads: thread::available_parallelism().map_or(1, usize::from),
+            compute_wait: Duration::from_millis(50),
+            compute_waiting_max: 256,
+            computation_time_max: Duration::from_secs(60),
+            request_bytes_max: 4 << 20,
+            connections_max: 1024,
+            streams_max: 256,
+            receive_time_max: Duration::from_secs(10),
+            shutdown_grace: Duration::from_secs(10),
+            store: StoreLocation::Memory { bytes_max: 256 << 20 },
+            cache_bytes_max: 256 << 20,
+            limits: Limits::default(),
+        }
+    }
+}
+
+/// One thing that is wrong with a configuration.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ConfigFault {
+    /// Name of the setting.
+    pub setting: &'static str,
+    /// What would be right.
+    pub expected: String,
+    /// What was found.
+    pub got: String,
+}
+
+impl fmt::Display for ConfigFault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: expected {}, got {}", self.setting, self.expected, self.got)
+    }
+}
+
+impl Config {
+    /// Everything that is wrong; empty if a node can start with it.
+    #[must_use]
+    pub fn faults(&self) -> Vec<ConfigFault> {
+        let mut faults = Vec::new();
+        let mut check = |good: bool, setting, expected: &str, got: String| {
+            if !good {
+                faults.push(ConfigFault { setting, expected: expected.to_owned(), got });
+            }
+        };
+        check(
+            self.listen.ip().is_loopback() || self.allow_insecure_listen,
+            "listen",
+            "a loopback address, or allow_insecure_listen (there is no authentication)",
+            self.listen.to_string(),
+        );
+        let mut count = |setting, value: usize, max: usize| {
+            let expected = format!("1 to {max}");
+            check((1..=max).contains(&value), setting, &expected, value.to_string());
+        };
+        count("compute_threads", self.compute_threads, 1024);
+        count("request_bytes_max", self.request_bytes_max, 1 << 30);
+        count("connections_max", self.connections_max, 1 << 20);
+        count("streams_max", usize::try_from(self.streams_max).unwrap_or(usize::MAX), 1 << 16);
+        count("limits.horizon_max", self.limits.horizon_max, 100_000);
+        count("limits.generators_max", self.limits.generators_max, 10_000);
+        count("limits.states_max", self.limits.states_max, 1000);
+        count("limits.inputs_max", self.limits.inputs_max, 1000);
+        count("limits.steps_max", self.limits.steps_max, 10_000_000);
+        count("limits.polytope_rows_max", self.limits.polytope_rows_max, 100_000);
+        let hour = Duration::from_secs(3600);
+        let mut time = |setting, value: Duration, least: Duration| {
+            let expected = format!("{least:?} to {hour:?}");
+            check((least..=hour).contains(&value), setting, &expected, format!("{value:?}"));
+        };
+        time("compute_wait", self.compute_wait, Duration::ZERO);
+        time("computation_time_max", self.computation_time_max, Duration::from_millis(1));
+        time("receive_time_max", self.receive_time_max, Duration::from_millis(1));
+        time("shutdown_grace", self.shutdown_grace, Duration::ZERO);
+        if let StoreLocation::Memory { bytes_max } = self.store {
+            check(bytes_max > 0, "store_bytes_max", "at least 1", bytes_max.to_string());
+        }
+        faults
+    }
+}
+
+/// What one source of configuration says; durations in seconds.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "each is the field of the same name in `Config` or `Limits`")]
+pub struct Settings {
+    pub listen: Option<SocketAddr>,
+    pub allow_insecure_listen: Option<bool>,
+    pub compute_threads: Option<usize>,
+    pub compute_wait_s: Option<f64>,
+    pub compute_waiting_max: Option<usize>,
+    pub computation_time_max_s: Option<f64>,
+    pub request_bytes_max: Option<usize>,
+    pub connections_max: Option<usize>,
+    pub streams_max: Option<u32>,
+    pub receive_time_max_s: Option<f64>,
+    pub shutdown_grace_s: Option<f64>,
+    /// Directory of the artifact store; absent: in memory.
+    pub store_directory: Option<PathBuf>,
+    /// Most bytes of a store in memory.
+    pub store_bytes_max: Option<usize>,
+    pub cache_bytes_max: Option<usize>,
+    pub horizon_max: Option<usize>,
+    pub generators_max: Option<usize>,
+    pub states_max: Option<usize>,
+    pub inputs_max: Option<usize>,
+    pub steps_max: Option<usize>,
+    pub polytope_rows_max: Option<usize>,
+}
+
+/// Why a source of configuration could not be read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SettingsError {
+    /// The file is not what it should be; the text names line and key.
+    #[error("configuration file: {0}")]
+    File(String),
+    /// Variables are not what they should be.
+    #[error("environment: {}", .0.join("; "))]
+    Environment(Vec<String>),
+    /// Numbers of seconds that are not durations.
+    #[error("not a duration: {}", .0.join("; "))]
+    Durations(Vec<String>),
+}
+
+/// Expands `$body!(field)` for every setting.
+macro_rules! for_each_setting {
+    ($body:ident) => {
+        $body!(
+            listen,
+            allow_insecure_listen,
+            compute_threads,
+            compute_wait_s,
+            compute_waiting_max,
+            computation_time_max_s,
+            request_bytes_max,
+            connections_max,
+            streams_max,
+            receive_time_max_s,
+            shutdown_grace_s,
+            store_directory,
+            store_bytes_max,
+            cache_bytes_max,
+            horizon_max,
+            generators_max,
+            states_max,
+            inputs_max,
+            steps_max,
+            polytope_rows_max
+        )
+    };
+}
+
+impl Settings {
+    /// From the text of a TOML file.
+    ///
+    /// # Errors
+    /// [`SettingsError::File`] with line and key.
+    pub fn from_toml(text: &str) -> Result<Self, SettingsError> {
+        toml::from_str(text).map_err(|fault| SettingsError::File(fault.to_string()))
+    }
+
+    /// From environment variables: `VBAR_LISTEN`, `VBAR_COMPUTE_THREADS`, … Other variables are
+    /// left alone, but an unknown name with the prefix is a fault: it is a typing error. Names in
+    /// `others` belong to the caller.
+    ///
+    /// # Errors
+    /// [`SettingsError::Environment`] with every fault.
+    pub fn from_environment(
+        variables: impl IntoIterator<Item = (String, String)>,
+        others: &[&str],
+    ) -> Result<Self, SettingsError> {
+        let mut settings = Self::default();
+        let mut faults = Vec::new();
+        for (name, text) in variables {
+            let Some(setting) = name.strip_prefix("VBAR_") else { continue };
+            if others.contains(&name.as_str()) {
+                continue;
+            }
+            if let Err(fault) = settings.set(&setting.to_ascii_lowercase(), &text) {
+                faults.push(format!("{name}: {fault}"));
+            }
+        }
+        if faults.is_empty() { Ok(settings) } else { Err(SettingsError::Environment(faults)) }
+    }
+
+    fn set(&mut self, setting: &str, text: &str) -> Result<(), String> {
+        macro_rules! set {
+            ($($field:ident),*) => {
+                match setting {
+                    $(stringify!($field) => {
+                        let value = text.parse();
+                        self.$field = Some(value.map_err(|fault| format!("{fault} in {text:?}"))?);
+                    })*
+                    _ => return Err("there is no such setting".to_owned()),
+                }
+            };
+        }
+        for_each_setting!(set);
+        Ok(())
+    }
+
+    /// These settings where they say something, `lower` elsewhere.
+    #[must_use]
+    pub fn over(self, lower: Self) -> Self {
+        macro_rules! over {
+            ($($field:ident),*) => { Self { $($field: self.$field.or(lower.$field)),* } };
+        }
+        for_each_setting!(over)
+    }
+
+    /// These settings where they say something, `config` elsewhere.
+    ///
+    /// # Errors
+    /// [`SettingsError::Durations`] with every number of seconds that is not a duration.
+    pub fn apply(self, config: Config) -> Result<Config, SettingsError> {
+        let mut faults = Vec::new();
+        let mut time = |name: &str, given: Option<f64>, default: Duration| match given {
+            None => default,
+            Some(seconds) => Duration::try_from_secs_f64(seconds).unwrap_or_else(|fault| {
+                faults.push(format!("{name} = {seconds}: {fault}"));
+                default
+            }),
+        };
+        let store = match (self.store_directory, self.store_bytes_max) {
+            (Some(directory), _) => StoreLocation::Directory(directory),
+            (None, Some(bytes_max)) => StoreLocation::Memory { bytes_max },
+            (None, None) => config.store,
+        };
+        let applied = Config {
+            listen: self.listen.unwrap_or(config.listen),
+            allow_insecure_listen: self
+                .allow_insecure_listen
+                .unwrap_or(config.allow_insecure_listen),
+            compute_threads: self.compute_threads.unwrap_or(config.compute_threads),
+            compute_wait: time("compute_wait_s", self.compute_wait_s, config.compute_wait),
+            compute_waiting_max: self.compute_waiting_max.unwrap_or(config.compute_waiting_max),
+            computation_time_max: time(
+                "computation_time_max_s",
+                self.computation_time_max_s,
+                config.computation_time_max,
+            ),
+            request_bytes_max: self.request_bytes_max.unwrap_or(config.request_bytes_max),
+            connections_max: self.connections_max.unwrap_or(config.connections_max),
+            streams_max: self.streams_max.unwrap_or(config.streams_max),
+            receive_time_max: time(
+                "receive_time_max_s",
+                self.receive_time_max_s,
+                config.receive_time_max,
+            ),
+            shutdown_grace: time("shutdown_grace_s", self.shutdown_grace_s, config.shutdown_grace),
+            store,
+            cache_bytes_max: self.cache_bytes_max.unwrap_or(config.cache_bytes_max),
+            limits: Limits {
+                horizon_max: self.horizon_max.unwrap_or(config.limits.horizon_max),
+                generators_max: self.generators_max.unwrap_or(config.limits.generators_max),
+                states_max: self.states_max.unwrap_or(config.limits.states_max),
+                inputs_max: self.inputs_max.unwrap_or(config.limits.inputs_max),
+                steps_max: self.steps_max.unwrap_or(config.limits.steps_max),
+                polytope_rows_max: self
+                    .polytope_rows_max
+                    .unwrap_or(config.limits.polytope_rows_max),
+            },
+        };
+        if faults.is_empty() { Ok(applied) } else { Err(SettingsError::Durations(faults)) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn variables(pairs: &[(&str, &str)]) -> Vec<(String, String)> {
+        pairs.iter().map(|(name, value)| ((*name).into(), (*value).into())).collect()
+    }
+
+    #[test]
+    fn config_default_has_no_fault() {
+        assert_eq!(Config::default().faults(), []);
+    }
+
+    #[test]
+    fn config_every_fault_is_named() {
+        let config = Config {
+            listen: "0.0.0.0:80".parse().unwrap(),
+            compute_threads: 0,
+            computation_time_max: Duration::ZERO,
+            limits: Limits { horizon_max: 0, ..Limits::default() },
+            ..Config::default()
+        };
+        let named: Vec<_> = config.faults().into_iter().map(|fault| fault.setting).collect();
+        let expected = ["listen", "compute_threads", "limits.horizon_max", "computation_time_max"];
+        assert_eq!(named, expected);
+    }
+
+    #[test]
+    fn config_beyond_loopback_only_if_told_so() {
+        let listen = "[::]:7878".parse().unwrap();
+        let open = Config { listen, ..Config::default() };
+        assert_eq!(open.faults().len(), 1);
+        let told = Config { allow_insecure_listen: true, ..open };
+        assert_eq!(told.faults(), []);
+    }
+
+    #[test]
+    fn settings_flags_over_environment_over_file_over_defaults() {
+        let file = Settings::from_toml(
+            "listen = '127.0.0.1:1'\ncompute_threads = 1\nhorizon_max = 7\ncompute_wait_s = 0.25",
+        )
+        .unwrap();
+        let environment = Settings::from_environment(
+            variables(&[
+                ("VBAR_LISTEN", "127.0.0.1:2"),
+                ("VBAR_COMPUTE_THREADS", "2"),
+                ("HOME", "x"),
+            ]),
+            &[],
+        )
+        .unwrap();
+        let flags =
+            Settings { listen: Some("127.0.0.1:3".parse().unwrap()), ..Settings::default() };
+        let config = flags.over(environment).over(file).apply(Config::default()).unwrap();
+        let expected = Config {
+            listen: "127.0.0.1:3".parse().unwrap(),
+            compute_threads: 2,
+            compute_wait: Duration::from_millis(250),
+            limits: Limits { horizon_max: 7, ..Limits::default() },
+            ..Config::default()
+        };
+        assert_eq!(config, expected);
+    }
+
+    #[test]
+    fn settings_faults_are_named() {
+        let file = Settings::from_toml("listen = '127.0.0.1:1'\nhorizon = 3").unwrap_err();
+        assert!(file.to_string().contains("line 2") && file.to_string().contains("horizon"));
+        let environment = Settings::from_environment(
+            variables(&[("VBAR_COMPUTE_THREADS", "many"), ("VBAR_LISTN", "x"), ("VBAR_LOG", "x")]),
+            &["VBAR_LOG"],
+        );
+        let text = environment.unwrap_err().to_string();
+        assert!(text.contains("VBAR_COMPUTE_THREADS") && text.contains("many"), "{text}");
+        assert!(text.contains("VBAR_LISTN") && !text.contains("VBAR_LOG"), "{text}");
+        let settings = Settings { compute_wait_s: Some(-1.0), ..Settings::default() };
+        let fault = settings.apply(Config::default()).unwrap_err().to_string();
+        assert!(fault.contains("compute_wait_s = -1"), "{fault}");
+    }
+}

@@ -1,0 +1,479 @@
+//! The service: what each call means, whatever it came over.
+
+mod cache;
+mod error;
+mod record;
+mod session;
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use bytes::Bytes;
+use sha2::{Digest, Sha256};
+use vbar_guidance::{
+    Budget, Method,
+    control::{Certificate, PrepareError, StepError},
+};
+
+pub(crate) use error::{Code, Error};
+pub(crate) use session::{Session, SessionAnswer};
+
+use crate::{
+    compute::{Compute, Timed},
+    store::{ArtifactStore, Put},
+    telemetry::{Metrics, OutcomeLabels},
+    wire::{
+        Artifact, ArtifactAnswer, ArtifactCall, ArtifactId, Controller, ControllerState,
+        DecidedStep, ElapsedAndState, InfoAnswer, InfoCall, Limits, OperationAnswer, OperationName,
+        OperationsAnswer, OperationsCall, PlanAnswer, PlanCall, PlanResult, PrecomputeCall,
+        Problem, Provenance, SolverWork, State, StateFault, StepAnswer, StepCall, VerdictKind,
+    },
+};
+use cache::{Cache, Outcome};
+use session::StateSource;
+
+/// Where a problem's own message stands in every request that carries one.
+fn problem_path(method: Method) -> String {
+    format!("problem.{}", method.name())
+}
+
+/// A decoded artifact with where it comes from.
+type Loaded = ArtifactAnswer;
+
+/// The controller that a step names, or the answer that there is none.
+enum Found {
+    Controller(Loaded),
+    None(StepAnswer),
+}
+
+/// What a call brings besides its message.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Call {
+    /// When an answer is no longer of use.
+    pub(crate) deadline: Instant,
+}
+
+/// The service.
+#[derive(Debug)]
+pub(crate) struct Service {
+    compute: Compute,
+    store: Arc<dyn ArtifactStore>,
+    cache: Cache,
+    metrics: Arc<Metrics>,
+    info: InfoAnswer,
+}
+
+impl Service {
+    /// A service that computes with `compute`, keeps artifacts in `store` and at most
+    /// `cache_bytes_max` bytes of them in memory.
+    pub(crate) fn new(
+        compute: Compute,
+        store: Arc<dyn ArtifactStore>,
+        cache_bytes_max: usize,
+        metrics: Arc<Metrics>,
+        info: InfoAnswer,
+    ) -> Self {
+        Self { compute, store, cache: Cache::new(cache_bytes_max), metrics, info }
+    }
+
+    /// The limits in force.
+    pub(crate) fn info(&self, _: InfoCall) -> InfoAnswer {
+        self.info
+    }
+
+    /// The limits that requests are parsed with.
+    pub(crate) fn limits(&self) -> Limits {
+        self.info.limits
+    }
+
+    /// Metrics.
+    pub(crate) fn metrics(&self) -> &Metrics {
+        &self.metrics
+    }
+
+    /// When a call that starts now must be answered: its own wish, within the server's limit.
+    pub(crate) fn deadline(&self, wish: Option<Duration>) -> Instant {
+        let limit = self.info.computation_time_max;
+        Instant::now() + wish.map_or(limit, |wish| wish.min(limit))
+    }
+
+    /// `Step`.
+    pub(crate) async fn step(
+        &self,
+        ask: StepCall,
+        call: &Call,
+    ) -> Result<Timed<StepAnswer>, Error> {
+        let artifact = match self.controller(ask.controller, call).await? {
+            Found::Controller(artifact) => artifact,
+            Found::None(value) => return Ok(Timed { value, compute: Duration::ZERO }),
+        };
+        let state = StateSource::Envelope(ask.controller_state);
+        let decided = self.decide(artifact, state, ask.measurement, ask.omit_prediction, call);
+        decided.await.map(|timed| timed.map(StepAnswer::Decided))
+    }
+
+    /// `ComputePlan`.
+    pub(crate) async fn plan(
+        &self,
+        ask: PlanCall,
+        call: &Call,
+    ) -> Result<Timed<PlanAnswer>, Error> {
+        if ask.validate_only {
+            let timed = self.validate(ask.problem, call).await?;
+            let (id, method) = timed.value;
+            let provenance = Arc::new(provenance(method, id, String::new()));
+            let value = PlanAnswer { provenance, outcome: None };
+            return Ok(Timed { value, compute: timed.compute });
+        }
+        let (method, id) = (ask.problem.method(), record::problem_id(&ask.problem));
+        let loaded = match self.obtain(id, ask.problem, call).await? {
+            Outcome::Made(loaded) => loaded,
+            Outcome::Infeasible(problem, why) => {
+                let provenance = Arc::new(provenance(method, id, String::new()));
+                let outcome = Some(PlanResult::NoController(problem, why));
+                let value = PlanAnswer { provenance, outcome };
+                return Ok(Timed { value, compute: Duration::ZERO });
+            }
+        };
+        let artifact = Arc::clone(&loaded.artifact);
+        let initial = ask.initial;
+        let work = move |budget: Budget<'_>| artifact.plan(&initial, budget);
+        let timed = self.compute.run("plan", call.deadline, work).await?;
+        let verdict = timed.value.map_err(|fault| Error::step("initial", fault))?;
+        self.count(verdict.work());
+        if let Some(certificate) = verdict.certificate() {
+            self.withhold_unless_passed(Some(certificate))?;
+        }
+        let outcome = Some(PlanResult::Decided(loaded.artifact, verdict));
+        let value = PlanAnswer { provenance: loaded.provenance, outcome };
+        Ok(Timed { value, compute: timed.compute })
+    }
+
+    /// `Precompute`. It answers when it is done: an operation is its artifact.
+    pub(crate) async fn precompute(
+        &self,
+        ask: PrecomputeCall,
+        call: &Call,
+    ) -> Result<OperationAnswer, Error> {
+        if ask.validate_only {
+            let (id, _) = self.validate(ask.problem, call).await?.value;
+            return Ok(OperationAnswer::Validated { id });
+        }
+        let id = record::problem_id(&ask.problem);
+        Ok(operation(id, self.obtain(id, ask.problem, call).await?))
+    }
+
+    /// `GetArtifact`.
+    pub(crate) async fn artifact(
+        &self,
+        ask: ArtifactCall,
+        call: &Call,
+    ) -> Result<ArtifactAnswer, Error> {
+        self.load(ask.id, call).await
+    }
+
+    /// `GetOperation` and `WaitOperation`: there is nothing to wait for, because
+    /// [`Service::precompute`] answers when it is done.
+    pub(crate) async fn operation(
+        &self,
+        ask: OperationName,
+        call: &Call,
+    ) -> Result<OperationAnswer, Error> {
+        match self.cache.get(&ask.id) {
+            Some(outcome) => Ok(operation(ask.id, outcome)),
+            None => match self.load(ask.id, call).await {
+                Ok(loaded) => Ok(OperationAnswer::Made(loaded)),
+                Err(error) if error.code == Code::NotFound => Err(Error::new(
+                    Code::NotFound,
+                    "OPERATION_UNKNOWN",
+                    format!("operation operations/{} is not known", ask.id),
+                )),
+                Err(error) => Err(error),
+            },
+        }
+    }
+
+    /// `ListOperations`: every stored artifact is a finished operation.
+    pub(crate) async fn operations(
+        &self,
+        ask: OperationsCall,
+        call: &Call,
+    ) -> Result<OperationsAnswer, Error> {
+        let store = Arc::clone(&self.store);
+        let list =
+            move |_: Budget<'_>| store.list(ask.after.as_ref().map(|id| &id.0), ask.page_size + 1);
+        let mut ids = self.compute.run("list", call.deadline, list).await?.value?;
+        let more = ids.len() > ask.page_size;
+        ids.truncate(ask.page_size);
+        let next = ids.last().filter(|_| more).map(|id| ArtifactId(*id));
+        let mut operations = Vec::with_capacity(ids.len());
+        for id in ids {
+            operations.push(OperationAnswer::Made(self.load(ArtifactId(id), call).await?));
+        }
+        Ok(OperationsAnswer { operations, next })
+    }
+
+    /// `CancelOperation`: an operation that can be named is done, and success promises nothing
+    /// (AIP-151).
+    pub(crate) async fn cancel_operation(
+        &self,
+        ask: OperationName,
+        call: &Call,
+    ) -> Result<(), Error> {
+        self.operation(ask, call).await.map(|_| ())
+    }
+
+    /// `DeleteOperation`: an operation has no record apart from its artifact, which must stay for
+    /// the steps that name it.
+    pub(crate) async fn delete_operation(
+        &self,
+        ask: OperationName,
+        call: &Call,
+    ) -> Result<(), Error> {
+        self.operation(ask, call).await?;
+        Err(Error::new(
+            Code::Unimplemented,
+            "OPERATION_IS_ITS_ARTIFACT",
+            "an operation has no record apart from its artifact, and artifacts are not deleted",
+        ))
+    }
+
+    /// Decides one step on a compute thread: state in, step, state out.
+    async fn decide(
+        &self,
+        artifact: Loaded,
+        state: StateSource,
+        measurement: ElapsedAndState,
+        omit_prediction: bool,
+        call: &Call,
+    ) -> Result<Timed<DecidedStep>, Error> {
+        let work = move |budget: Budget<'_>| -> Result<DecidedStep, Error> {
+            let state = match state {
+                StateSource::Decoded(state) => *state,
+                StateSource::Envelope(bytes) => load_state(&artifact, &bytes)?,
+            };
+            let step = artifact.artifact.step(&state, &measurement, budget);
+            let step = step.map_err(|fault: StepError| Error::step("measurement", fault))?;
+            let controller_state = seal_state(&artifact, &step.next());
+            let Loaded { artifact, provenance, .. } = artifact;
+            Ok(DecidedStep { artifact, provenance, step, controller_state, omit_prediction })
+        };
+        let timed = self.compute.run("step", call.deadline, work).await?;
+        let answer = timed.value?;
+        self.count(answer.step.work());
+        let outcome = match answer.step.kind() {
+            VerdictKind::Command => "command",
+            VerdictKind::Arrived => "arrived",
+            VerdictKind::Infeasible => "infeasible",
+        };
+        if answer.step.kind() == VerdictKind::Command {
+            self.withhold_unless_passed(answer.step.certificate())?;
+        }
+        self.metrics.verdicts.get_or_create(&OutcomeLabels { outcome }).inc();
+        Ok(Timed { value: answer, compute: timed.compute })
+    }
+
+    /// The artifact a step is to use.
+    async fn controller(&self, controller: Controller, call: &Call) -> Result<Found, Error> {
+        match controller {
+            Controller::Artifact(id) => self.load(id, call).await.map(Found::Controller),
+            Controller::Problem(problem) => {
+                let id = record::problem_id(&problem);
+                match self.obtain(id, problem, call).await? {
+                    Outcome::Made(loaded) => Ok(Found::Controller(loaded)),
+                    Outcome::Infeasible(problem, why) => {
+                        let provenance = provenance(problem.method(), id, String::new());
+                        let provenance = Arc::new(provenance);
+                        Ok(Found::None(StepAnswer::NoController { problem, why, provenance }))
+                    }
+                }
+            }
+        }
+    }
+
+    /// A stored artifact.
+    async fn load(&self, id: ArtifactId, call: &Call) -> Result<Loaded, Error> {
+        if let Some(Outcome::Made(loaded)) = self.cache.get(&id) {
+            self.looked_up("hit");
+            return Ok(loaded);
+        }
+        let store = Arc::clone(&self.store);
+        let work = move |_: Budget<'_>| stored(&*store, id);
+        let Some(loaded) = self.compute.run("load", call.deadline, work).await?.value? else {
+            self.looked_up("unknown");
+            let message = format!("artifact {id} is not known; Precompute makes it");
+            return Err(Error::new(Code::NotFound, "ARTIFACT_UNKNOWN", message));
+        };
+        self.looked_up("loaded");
+        self.cache.insert(id, Outcome::Made(loaded.clone()));
+        Ok(loaded)
+    }
+
+    /// What a precompute of `problem`, whose id is `id`, comes to: remembered, stored, or computed
+    /// and stored.
+    async fn obtain(
+        &self,
+        id: ArtifactId,
+        problem: Problem,
+        call: &Call,
+    ) -> Result<Outcome, Error> {
+        if let Some(outcome) = self.cache.get(&id) {
+            self.looked_up("hit");
+            return Ok(outcome);
+        }
+        let store = Arc::clone(&self.store);
+        let work = move |budget: Budget<'_>| -> Result<(Outcome, &'static str), Error> {
+            if let Some(loaded) = stored(&*store, id)? {
+                return Ok((Outcome::Made(loaded), "loaded"));
+            }
+            let artifact = match problem.prepare(budget) {
+                Ok(artifact) => artifact,
+                Err(PrepareError::Infeasible(why)) => {
+                    return Ok((Outcome::Infeasible(problem, Arc::new(why)), "computed"));
+                }
+                Err(fault) => {
+                    return Err(Error::prepare(&problem_path(problem.method()), fault));
+                }
+            };
+            keep(&*store, id, artifact).map(|loaded| (Outcome::Made(loaded), "computed"))
+        };
+        let timed = self.compute.run("precompute", call.deadline, work).await?;
+        let (outcome, source) = timed.value.inspect_err(|error| {
+            if error.reason == CONFLICT {
+                self.metrics.artifact_conflicts.inc();
+            }
+        })?;
+        self.looked_up(source);
+        self.cache.insert(id, outcome.clone());
+        Ok(outcome)
+    }
+
+    /// Finds every fault of a problem, those that only the mathematics sees included; keeps
+    /// nothing.
+    async fn validate(
+        &self,
+        problem: Problem,
+        call: &Call,
+    ) -> Result<Timed<(ArtifactId, Method)>, Error> {
+        let (id, method) = (record::problem_id(&problem), problem.method());
+        if self.cache.get(&id).is_some() {
+            return Ok(Timed { value: (id, method), compute: Duration::ZERO });
+        }
+        let work = move |budget: Budget<'_>| match problem.prepare(budget) {
+            // That no controller exists is an answer to the request, not a fault in it.
+            Ok(_) | Err(PrepareError::Infeasible(_)) => Ok(()),
+            Err(fault) => Err(Error::prepare(&problem_path(method), fault)),
+        };
+        let timed = self.compute.run("validate", call.deadline, work).await?;
+        timed.value?;
+        Ok(Timed { value: (id, method), compute: timed.compute })
+    }
+
+    /// An answer whose certificate did not pass never leaves as an answer.
+    fn withhold_unless_passed(&self, certificate: Option<&Certificate>) -> Result<(), Error> {
+        if certificate.is_some_and(|certificate| certificate.passed) {
+            return Ok(());
+        }
+        self.metrics.certificate_failures.inc();
+        let detail = format!("{certificate:?}");
+        Err(Error::internal("CERTIFICATE_FAILED", &detail))
+    }
+
+    fn count(&self, work: SolverWork) {
+        let count = |n: usize| u64::try_from(n).unwrap_or(u64::MAX);
+        self.metrics.simplex_pivots.inc_by(count(work.simplex_pivots));
+        self.metrics.general_solver_calls.inc_by(count(work.general_solver_calls));
+    }
+
+    fn looked_up(&self, outcome: &'static str) {
+        self.metrics.artifacts.get_or_create(&OutcomeLabels { outcome }).inc();
+    }
+}
+
+const CONFLICT: &str = "ARTIFACT_CONFLICT";
+
+fn operation(id: ArtifactId, outcome: Outcome) -> OperationAnswer {
+    match outcome {
+        Outcome::Made(loaded) => OperationAnswer::Made(loaded),
+        Outcome::Infeasible(problem, why) => OperationAnswer::Infeasible { id, problem, why },
+    }
+}
+
+fn provenance(method: Method, id: ArtifactId, content_sha256: String) -> Provenance {
+    Provenance {
+        method: method.name(),
+        method_version: method.version(),
+        artifact_id: id.to_string(),
+        content_sha256,
+    }
+}
+
+fn loaded(id: ArtifactId, artifact: Artifact, bytes: &[u8]) -> Loaded {
+    let content = ArtifactId(Sha256::digest(bytes).into()).to_string();
+    let provenance = provenance(artifact.method(), id, content);
+    Loaded {
+        id,
+        artifact: Arc::new(artifact),
+        provenance: Arc::new(provenance),
+        size_bytes: bytes.len(),
+    }
+}
+
+/// Reads and checks what is stored under `id`.
+fn stored(store: &dyn ArtifactStore, id: ArtifactId) -> Result<Option<Loaded>, Error> {
+    let Some(record) = store.get(&id.0)? else { return Ok(None) };
+    match record::decode(id, &record) {
+        Ok((artifact, bytes)) => Ok(Some(loaded(id, artifact, bytes))),
+        Err(what) => {
+            tracing::error!(%id, what, "unreadable record");
+            let message = format!("the record of artifact {id} cannot be used: {what}");
+            Err(Error::new(Code::DataLoss, "ARTIFACT_DAMAGED", message))
+        }
+    }
+}
+
+/// Stores a new artifact. If another call was faster, both must have made the same bytes.
+fn keep(store: &dyn ArtifactStore, id: ArtifactId, artifact: Artifact) -> Result<Loaded, Error> {
+    let bytes = artifact.to_bytes();
+    let record = Bytes::from(record::encode(artifact.method(), &bytes));
+    match store.put_if_absent(&id.0, record.clone())? {
+        Put::Created => {}
+        Put::Existing(existing) if existing == record => {}
+        Put::Existing(_) => {
+            return Err(Error::internal(CONFLICT, &format!("two contents for artifact {id}")));
+        }
+    }
+    Ok(loaded(id, artifact, &bytes))
+}
+
+/// Reads a controller state; an empty one means the start.
+fn load_state(artifact: &Loaded, bytes: &[u8]) -> Result<State, Error> {
+    if bytes.is_empty() {
+        return Ok(artifact.artifact.start());
+    }
+    let envelope = ControllerState::decode(bytes)?;
+    if envelope.artifact_id != artifact.id {
+        return Err(StateFault::Artifact(envelope.artifact_id).into());
+    }
+    let state =
+        State::from_bytes(envelope.method, envelope.payload).map_err(StateFault::Payload)?;
+    let payload = state.step_index();
+    if usize::try_from(envelope.step_index).ok() != Some(payload) {
+        return Err(StateFault::StepIndex { envelope: envelope.step_index, payload }.into());
+    }
+    Ok(state)
+}
+
+/// Writes a controller state.
+fn seal_state(artifact: &Loaded, state: &State) -> Bytes {
+    let payload = state.to_bytes();
+    ControllerState {
+        method: artifact.artifact.method(),
+        artifact_id: artifact.id,
+        step_index: u32::try_from(state.step_index()).unwrap_or(u32::MAX),
+        payload: &payload,
+    }
+    .encode()
+}

@@ -1,0 +1,128 @@
+//! Where artifacts are kept: bytes under ids, created once, never changed.
+//!
+//! One contract, two back-ends, one conformance suite (below) that both pass. The store knows
+//! nothing of what the bytes mean.
+
+mod directory;
+mod memory;
+
+use std::{fmt::Debug, io};
+
+use bytes::Bytes;
+
+pub(crate) use directory::DirectoryStore;
+pub(crate) use memory::MemoryStore;
+
+/// Names one record.
+pub(crate) type RecordId = [u8; 32];
+
+/// Keeps records.
+///
+/// Contract: a record is created whole or not at all; once `put_if_absent` has answered, `get`
+/// gives exactly those bytes or an error that says why not; nothing ever replaces them.
+/// Calls may block on a disk: call them where that is allowed.
+pub(crate) trait ArtifactStore: Debug + Send + Sync {
+    /// Creates the record unless it exists; answers what is there already.
+    fn put_if_absent(&self, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError>;
+
+    /// The record, verified against its digest; `None` if there is none.
+    fn get(&self, id: &RecordId) -> Result<Option<Bytes>, StoreError>;
+
+    /// Up to `limit` ids above `after`, in ascending order.
+    fn list(&self, after: Option<&RecordId>, limit: usize) -> Result<Vec<RecordId>, StoreError>;
+}
+
+/// What came of [`ArtifactStore::put_if_absent`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Put {
+    /// The record is new.
+    Created,
+    /// It was there; these are its bytes.
+    Existing(Bytes),
+}
+
+/// Why the store could not do what was asked.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum StoreError {
+    /// What is stored is not what was put.
+    #[error("record {id} is damaged: {what}")]
+    Damaged { id: String, what: &'static str },
+    /// There is no room.
+    #[error("the store is full: {0}")]
+    Full(String),
+    /// The world.
+    #[error("{doing}: {source}")]
+    Io { doing: String, source: io::Error },
+}
+
+fn hex(bytes: &[u8]) -> String {
+    use std::fmt::Write as _;
+    bytes.iter().fold(String::with_capacity(bytes.len() * 2), |mut text, byte| {
+        write!(text, "{byte:02x}").expect("a String takes everything");
+        text
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn id(n: u8) -> RecordId {
+        let mut id = [0xa5; 32];
+        id[0] = n;
+        id
+    }
+
+    /// Every back-end keeps the contract.
+    fn check_conformance(store: &dyn ArtifactStore) {
+        assert_eq!(store.get(&id(1)).unwrap(), None);
+        assert_eq!(store.list(None, 10).unwrap(), Vec::<RecordId>::new());
+
+        let put = |n: u8, text: &'static [u8]| store.put_if_absent(&id(n), text.into()).unwrap();
+        assert_eq!(put(2, b"two"), Put::Created);
+        assert_eq!(put(9, b""), Put::Created);
+        assert_eq!(put(1, b"one"), Put::Created);
+        // The first bytes stay, whatever comes later.
+        assert_eq!(put(2, b"two"), Put::Existing(b"two".as_slice().into()));
+        assert_eq!(put(2, b"other"), Put::Existing(b"two".as_slice().into()));
+
+        assert_eq!(store.get(&id(1)).unwrap().as_deref(), Some(b"one".as_slice()));
+        assert_eq!(store.get(&id(2)).unwrap().as_deref(), Some(b"two".as_slice()));
+        assert_eq!(store.get(&id(9)).unwrap().as_deref(), Some(b"".as_slice()));
+        assert_eq!(store.get(&id(3)).unwrap(), None);
+
+        assert_eq!(store.list(None, 10).unwrap(), [id(1), id(2), id(9)]);
+        assert_eq!(store.list(None, 2).unwrap(), [id(1), id(2)]);
+        assert_eq!(store.list(Some(&id(2)), 10).unwrap(), [id(9)]);
+        assert_eq!(store.list(Some(&id(5)), 10).unwrap(), [id(9)]);
+        assert_eq!(store.list(Some(&id(9)), 10).unwrap(), Vec::<RecordId>::new());
+
+        // Many writers, one winner, everybody sees the winner's bytes.
+        let seen: Vec<_> = std::thread::scope(|scope| {
+            let writers: Vec<_> = (0..8u8)
+                .map(|writer| {
+                    scope.spawn(move || {
+                        store.put_if_absent(&id(100), Bytes::from(vec![writer; 1000])).unwrap()
+                    })
+                })
+                .collect();
+            writers.into_iter().map(|writer| writer.join().unwrap()).collect()
+        });
+        let winner = store.get(&id(100)).unwrap().unwrap();
+        assert_eq!(seen.iter().filter(|put| **put == Put::Created).count(), 1);
+        for put in seen {
+            assert!(put == Put::Created || put == Put::Existing(winner.clone()));
+        }
+    }
+
+    #[test]
+    fn memory_store_conforms() {
+        check_conformance(&MemoryStore::new(1 << 20));
+    }
+
+    #[test]
+    fn directory_store_conforms() {
+        let folder = tempfile::tempdir().unwrap();
+        check_conformance(&DirectoryStore::open(folder.path()).unwrap());
+    }
+}

@@ -1,0 +1,152 @@
+//! Prometheus metrics: rate, errors and duration of every method, and what the solvers did.
+
+use prometheus_client::{
+    encoding::{EncodeLabelSet, text::encode},
+    metrics::{
+        counter::Counter,
+        family::Family,
+        gauge::Gauge,
+        histogram::{Histogram, exponential_buckets},
+    },
+    registry::{Registry, Unit},
+};
+
+/// One finished call.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct CallLabels {
+    /// The RPC or route; one of a fixed list.
+    pub(crate) method: &'static str,
+    /// `grpc` or `http`.
+    pub(crate) transport: &'static str,
+    /// Name of its `google.rpc.Code`.
+    pub(crate) code: &'static str,
+}
+
+/// A kind of work.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct MethodLabels {
+    /// What is done.
+    pub(crate) method: &'static str,
+}
+
+/// What came of something.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct OutcomeLabels {
+    /// One of a fixed list.
+    pub(crate) outcome: &'static str,
+}
+
+/// Every metric of a node.
+#[derive(Debug)]
+pub(crate) struct Metrics {
+    registry: Registry,
+    /// Calls finished.
+    pub(crate) requests: Family<CallLabels, Counter>,
+    /// Time from a call's head to its answer's head.
+    pub(crate) request_seconds: Family<MethodLabels, Histogram>,
+    /// Answers of closed loops.
+    pub(crate) stream_messages: Family<OutcomeLabels, Counter>,
+    /// Time on a compute thread.
+    pub(crate) compute_seconds: Family<MethodLabels, Histogram>,
+    /// Time a call waited for a compute thread.
+    pub(crate) compute_wait_seconds: Histogram,
+    /// Computations under way.
+    pub(crate) computations: Gauge,
+    /// Calls waiting for a compute thread.
+    pub(crate) compute_waiting: Gauge,
+    /// Calls refused because no compute thread was free.
+    pub(crate) compute_refused: Counter,
+    /// Computations that panicked.
+    pub(crate) compute_panics: Counter,
+    /// Steps by verdict.
+    pub(crate) verdicts: Family<OutcomeLabels, Counter>,
+    /// Simplex pivots.
+    pub(crate) simplex_pivots: Counter,
+    /// Programs the simplex gave up to the general solver.
+    pub(crate) general_solver_calls: Counter,
+    /// Answers withheld because their certificate did not pass.
+    pub(crate) certificate_failures: Counter,
+    /// Artifact look-ups: `hit`, `loaded`, `computed`, `unknown`.
+    pub(crate) artifacts: Family<OutcomeLabels, Counter>,
+    /// Same problem, different artifact: determinism broke.
+    pub(crate) artifact_conflicts: Counter,
+    /// Open connections.
+    pub(crate) connections: Gauge,
+    /// Connections dropped because too many were open.
+    pub(crate) connections_refused: Counter,
+}
+
+/// 50 µs to 26 s.
+fn durations() -> Histogram {
+    Histogram::new(exponential_buckets(50e-6, 2.0, 20))
+}
+
+impl Metrics {
+    /// All of them, at zero.
+    pub(crate) fn new() -> Self {
+        let mut metrics = Self {
+            registry: Registry::with_prefix("vbar"),
+            requests: Family::default(),
+            request_seconds: Family::new_with_constructor(durations),
+            stream_messages: Family::default(),
+            compute_seconds: Family::new_with_constructor(durations),
+            compute_wait_seconds: durations(),
+            computations: Gauge::default(),
+            compute_waiting: Gauge::default(),
+            compute_refused: Counter::default(),
+            compute_panics: Counter::default(),
+            verdicts: Family::default(),
+            simplex_pivots: Counter::default(),
+            general_solver_calls: Counter::default(),
+            certificate_failures: Counter::default(),
+            artifacts: Family::default(),
+            artifact_conflicts: Counter::default(),
+            connections: Gauge::default(),
+            connections_refused: Counter::default(),
+        };
+        metrics.register();
+        metrics
+    }
+
+    fn register(&mut self) {
+        let r = &mut self.registry;
+        r.register("requests", "Calls finished", self.requests.clone());
+        let help = "From a call's head to its answer's head";
+        r.register_with_unit("request", help, Unit::Seconds, self.request_seconds.clone());
+        r.register("stream_messages", "Answers in closed loops", self.stream_messages.clone());
+        let help = "Time on a compute thread";
+        r.register_with_unit("compute", help, Unit::Seconds, self.compute_seconds.clone());
+        let help = "Time spent waiting for a compute thread";
+        r.register_with_unit(
+            "compute_wait",
+            help,
+            Unit::Seconds,
+            self.compute_wait_seconds.clone(),
+        );
+        r.register("computations", "Computations under way", self.computations.clone());
+        let help = "Calls waiting for a compute thread";
+        r.register("compute_waiting", help, self.compute_waiting.clone());
+        let help = "Calls refused because no compute thread was free";
+        r.register("compute_refused", help, self.compute_refused.clone());
+        r.register("compute_panics", "Computations that panicked", self.compute_panics.clone());
+        r.register("verdicts", "Steps by verdict", self.verdicts.clone());
+        r.register("simplex_pivots", "Pivots of the simplex", self.simplex_pivots.clone());
+        let help = "Programs the simplex gave up to the general solver";
+        r.register("general_solver_calls", help, self.general_solver_calls.clone());
+        let help = "Answers withheld because their certificate did not pass";
+        r.register("certificate_failures", help, self.certificate_failures.clone());
+        r.register("artifact_lookups", "Where artifacts came from", self.artifacts.clone());
+        let help = "Same problem, different artifact: determinism broke";
+        r.register("artifact_conflicts", help, self.artifact_conflicts.clone());
+        r.register("connections", "Open connections", self.connections.clone());
+        let help = "Connections dropped because too many were open";
+        r.register("connections_refused", help, self.connections_refused.clone());
+    }
+
+    /// The OpenMetrics text.
+    pub(crate) fn text(&self) -> String {
+        let mut text = String::new();
+        encode(&mut text, &self.registry).expect("a String takes everything");
+        text
+    }
+}

@@ -1,0 +1,59 @@
+//! Errors as gRPC statuses with `google.rpc` details.
+
+use std::collections::HashMap;
+
+use prost::Message as _;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
+use vbar_proto::google::rpc;
+
+use crate::{service::Error, telemetry::RequestId, transport::ERROR_DOMAIN, wire::Violation};
+
+/// The status for `error` in the request `id`.
+pub(super) fn render(error: Error, id: &RequestId) -> Status {
+    let code = Code::from(error.code.number());
+    let mut details = ErrorDetails::new();
+    details.set_error_info(error.reason, ERROR_DOMAIN, HashMap::new());
+    details.set_request_info(&*id.0, "");
+    if !error.violations.is_empty() {
+        let violation = |violation: &Violation| FieldViolation {
+            field: violation.path.clone(),
+            description: violation.to_string(),
+            reason: "INVALID_VALUE".to_owned(),
+            localized_message: None,
+        };
+        details.set_bad_request(error.violations.iter().map(violation).collect::<Vec<_>>());
+    }
+    if let Some(delay) = error.retry_after {
+        details.set_retry_info(Some(delay));
+    }
+    Status::with_error_details(code, error.message, details)
+}
+
+/// A status that the gRPC library made itself (a message it could not read, a method it does not
+/// know), with the details that our own have.
+pub(in crate::transport) fn complete(status: Status, id: &RequestId) -> Status {
+    if status.code() == Code::Ok || !status.details().is_empty() {
+        return status;
+    }
+    let reason = match status.code() {
+        Code::InvalidArgument => "MALFORMED_MESSAGE",
+        Code::OutOfRange => "REQUEST_TOO_LARGE",
+        Code::Unimplemented => "METHOD_UNKNOWN",
+        _ => "TRANSPORT",
+    };
+    let mut details = ErrorDetails::new();
+    details.set_error_info(reason, ERROR_DOMAIN, HashMap::new());
+    details.set_request_info(&*id.0, "");
+    Status::with_error_details(status.code(), status.message(), details)
+}
+
+/// The same as a message within a stream.
+pub(super) fn message(status: &Status) -> rpc::Status {
+    // `with_error_details` put a whole `google.rpc.Status` into the details.
+    rpc::Status::decode(status.details()).unwrap_or_else(|_| rpc::Status {
+        code: status.code().into(),
+        message: status.message().to_owned(),
+        details: Vec::new(),
+    })
+}

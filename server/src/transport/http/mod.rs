@@ -1,0 +1,342 @@
+//! JSON over HTTP: the messages of the contract as canonical proto3 JSON.
+
+mod errors;
+mod json;
+mod openapi;
+
+use std::{sync::Arc, time::Duration};
+
+use axum::{
+    Router,
+    body::{Body, Bytes},
+    extract::{Path, Request, State},
+    response::{IntoResponse as _, Response},
+    routing::{any, get, post},
+};
+use http::{HeaderMap, HeaderValue, Method, StatusCode, header, request::Parts};
+use http_body_util::{BodyExt as _, LengthLimitError, Limited};
+use prost::{Message, Name};
+use vbar_proto::{google::longrunning, v1};
+
+use super::{SERVER_TIMING, TransportOptions, deadline_fault, server_timing};
+use crate::{
+    compute::Timed,
+    service::{Call, Code, Error, Service},
+    telemetry::RequestId,
+    wire::{NamedBy, Parse, Render, parse},
+};
+use errors::HttpError;
+
+pub(super) use errors::unknown_path;
+
+const JSON: HeaderValue = HeaderValue::from_static("application/json");
+const TEXT: HeaderValue = HeaderValue::from_static("text/plain; charset=utf-8");
+const OPENMETRICS: HeaderValue =
+    HeaderValue::from_static("application/openmetrics-text; version=1.0.0; charset=utf-8");
+/// A caller's deadline in milliseconds.
+const TIMEOUT: &str = "request-timeout-ms";
+
+/// What the handlers share.
+#[derive(Debug)]
+struct Http {
+    service: Arc<Service>,
+    options: TransportOptions,
+    openapi: Bytes,
+}
+
+type Shared = State<Arc<Http>>;
+
+/// Every HTTP route.
+pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Router {
+    let http = Arc::new(Http {
+        service: Arc::clone(service),
+        options: options.clone(),
+        openapi: openapi::document().to_string().into(),
+    });
+    Router::new()
+        .route("/v1/plans:compute", post(compute_plan))
+        .route("/v1/precompute", post(precompute))
+        .route("/v1/operations", get(list_operations))
+        .route("/v1/operations/{id}", any(operation))
+        .route("/v1/artifacts/{id}", get(get_artifact))
+        .route("/v1/step", post(step))
+        .route("/v1/info", get(info))
+        .route("/healthz", get(async || text(StatusCode::OK, "alive\n")))
+        .route("/readyz", get(ready))
+        .route("/metrics", get(metrics))
+        .route("/openapi.json", get(openapi))
+        .method_not_allowed_fallback(errors::method_not_allowed)
+        .with_state(http)
+}
+
+async fn compute_plan(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, body)| {
+        let (ask, call) = http.message::<_, v1::ComputePlanRequest>(&parts, body).await?;
+        Ok(timed(http.service.plan(ask, &call).await?))
+    })
+    .await
+}
+
+async fn precompute(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, body)| {
+        let (ask, call) = http.message::<_, v1::PrecomputeRequest>(&parts, body).await?;
+        Ok(rendered(&http.service.precompute(ask, &call).await?))
+    })
+    .await
+}
+
+async fn step(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, body)| {
+        let (ask, call) = http.message::<_, v1::StepRequest>(&parts, body).await?;
+        Ok(timed(http.service.step(ask, &call).await?))
+    })
+    .await
+}
+
+async fn get_artifact(
+    State(http): Shared,
+    Path(artifact_id): Path<String>,
+    request: Request,
+) -> Response {
+    http.call(request, async |http: &Http, (parts, _)| {
+        no_query(&parts)?;
+        let (ask, call) = http.parsed(&parts, &v1::GetArtifactRequest { artifact_id })?;
+        Ok(rendered(&http.service.artifact(ask, &call).await?))
+    })
+    .await
+}
+
+async fn info(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, _)| {
+        no_query(&parts)?;
+        let (ask, _) = http.parsed(&parts, &v1::GetServerInfoRequest {})?;
+        Ok(rendered(&http.service.info(ask)))
+    })
+    .await
+}
+
+async fn list_operations(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, _)| {
+        let message = list_request(parts.uri.query().unwrap_or_default())?;
+        let (ask, call) = http.parsed(&parts, &message)?;
+        Ok(rendered(&http.service.operations(ask, &call).await?))
+    })
+    .await
+}
+
+/// `GET` and `DELETE /v1/operations/{id}`, `POST /v1/operations/{id}:wait` and `:cancel`.
+///
+/// The router takes whole segments only, so the verb and what it allows are told apart here.
+async fn operation(State(http): Shared, Path(segment): Path<String>, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, body)| {
+        let (id, verb) = match segment.rsplit_once(':') {
+            Some((id, verb @ ("wait" | "cancel"))) => (id, verb),
+            _ => (segment.as_str(), ""),
+        };
+        let by_name = NamedBy::operation(id);
+        match (&parts.method, verb) {
+            (&Method::GET | &Method::HEAD, "") => {
+                no_query(&parts)?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                Ok(rendered(&http.service.operation(ask, &call).await?))
+            }
+            (&Method::DELETE, "") => {
+                no_query(&parts)?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                http.service.delete_operation(ask, &call).await?;
+                Ok(empty())
+            }
+            (&Method::POST, "wait") => {
+                no_query(&parts)?;
+                http.optional_message::<longrunning::WaitOperationRequest>(&parts, body).await?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                Ok(rendered(&http.service.operation(ask, &call).await?))
+            }
+            (&Method::POST, "cancel") => {
+                no_query(&parts)?;
+                http.optional_message::<longrunning::CancelOperationRequest>(&parts, body).await?;
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                http.service.cancel_operation(ask, &call).await?;
+                Ok(empty())
+            }
+            (_, "") => Err(HttpError::method_not_allowed("GET,HEAD,DELETE")),
+            _ => Err(HttpError::method_not_allowed("POST")),
+        }
+    })
+    .await
+}
+
+async fn ready(State(http): Shared) -> Response {
+    if *http.options.draining.borrow() {
+        return text(StatusCode::SERVICE_UNAVAILABLE, "shutting down\n");
+    }
+    text(StatusCode::OK, "ready\n")
+}
+
+async fn metrics(State(http): Shared) -> Response {
+    ([(header::CONTENT_TYPE, OPENMETRICS)], http.service.metrics().text()).into_response()
+}
+
+async fn openapi(State(http): Shared) -> Response {
+    ([(header::CONTENT_TYPE, JSON)], http.openapi.clone()).into_response()
+}
+
+fn text(status: StatusCode, text: &'static str) -> Response {
+    (status, [(header::CONTENT_TYPE, TEXT)], text).into_response()
+}
+
+fn empty() -> Response {
+    ([(header::CONTENT_TYPE, JSON)], "{}").into_response()
+}
+
+fn rendered<A: Render>(answer: &A) -> Response
+where
+    A::Message: Message + Name,
+{
+    ([(header::CONTENT_TYPE, JSON)], json::encode(&answer.render())).into_response()
+}
+
+fn timed<A: Render>(answer: Timed<A>) -> Response
+where
+    A::Message: Message + Name,
+{
+    let mut response = rendered(&answer.value);
+    response.headers_mut().insert(SERVER_TIMING, server_timing(answer.compute));
+    response
+}
+
+impl Http {
+    /// Lets `answer` have the request and writes its errors.
+    async fn call(
+        &self,
+        request: Request,
+        answer: impl AsyncFnOnce(&Self, (Parts, Body)) -> Result<Response, HttpError>,
+    ) -> Response {
+        let id = request.extensions().get().cloned().unwrap_or_else(RequestId::fresh);
+        match answer(self, request.into_parts()).await {
+            Ok(response) => response,
+            Err(error) => error.render(&id),
+        }
+    }
+
+    /// Reads the request's message.
+    async fn message<P, M>(&self, parts: &Parts, body: Body) -> Result<(P, Call), HttpError>
+    where
+        P: Parse<Message = M>,
+        M: Message + Name + Default,
+    {
+        no_query(parts)?;
+        is_json(&parts.headers)?;
+        let bytes = self.body(&parts.headers, body).await?;
+        self.parsed(parts, &json::decode::<M>(&bytes)?)
+    }
+
+    /// A message of which nothing is needed, and which may be left out; if it is there, it must
+    /// be one.
+    async fn optional_message<M>(&self, parts: &Parts, body: Body) -> Result<(), HttpError>
+    where
+        M: Message + Name + Default,
+    {
+        let bytes = self.body(&parts.headers, body).await?;
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        is_json(&parts.headers)?;
+        json::decode::<M>(&bytes)?;
+        Ok(())
+    }
+
+    /// Checks a message and reads what every call brings.
+    fn parsed<P: Parse>(
+        &self,
+        parts: &Parts,
+        message: &P::Message,
+    ) -> Result<(P, Call), HttpError> {
+        let wish = match parts.headers.get(TIMEOUT) {
+            None => None,
+            Some(value) => {
+                let text = value.to_str().ok().filter(|text| text.len() <= 9);
+                let expected = "a whole number of milliseconds, up to 9 digits";
+                let milliseconds = text
+                    .filter(|text| text.bytes().all(|c| c.is_ascii_digit()))
+                    .and_then(|text| text.parse().ok())
+                    .ok_or_else(|| deadline_fault(TIMEOUT, expected, value))?;
+                Some(Duration::from_millis(milliseconds))
+            }
+        };
+        let call = Call { deadline: self.service.deadline(wish) };
+        Ok((parse(message, &self.service.limits()).map_err(Error::from)?, call))
+    }
+
+    /// The whole body, within the limits of size and time.
+    async fn body(&self, headers: &HeaderMap, body: Body) -> Result<Bytes, HttpError> {
+        let largest = self.options.request_bytes_max;
+        let announced = headers
+            .get(header::CONTENT_LENGTH)
+            .and_then(|value| value.to_str().ok()?.parse::<u64>().ok());
+        if announced.is_some_and(|length| length > u64::try_from(largest).unwrap_or(u64::MAX)) {
+            return Err(HttpError::too_large(largest));
+        }
+        let received = Limited::new(body, largest).collect();
+        match tokio::time::timeout(self.options.receive_time_max, received).await {
+            Ok(Ok(body)) => Ok(body.to_bytes()),
+            Ok(Err(fault)) if fault.is::<LengthLimitError>() => Err(HttpError::too_large(largest)),
+            Ok(Err(_)) => {
+                let message = "the request's body ended early";
+                Err(Error::new(Code::InvalidArgument, "BODY_TRUNCATED", message).into())
+            }
+            Err(_) => Err(HttpError::too_slow(self.options.receive_time_max)),
+        }
+    }
+}
+
+/// Only JSON, and only as it is: a compressed body could be a bomb.
+fn is_json(headers: &HeaderMap) -> Result<(), HttpError> {
+    let given = headers.get(header::CONTENT_TYPE).map(HeaderValue::as_bytes).unwrap_or_default();
+    let essence = given.split(|&c| c == b';').next().unwrap_or_default().trim_ascii();
+    if !essence.eq_ignore_ascii_case(b"application/json") {
+        let got = String::from_utf8_lossy(given);
+        return Err(HttpError::unsupported("content-type", "application/json", &got));
+    }
+    match headers.get(header::CONTENT_ENCODING) {
+        None => Ok(()),
+        Some(value) if value.as_bytes().eq_ignore_ascii_case(b"identity") => Ok(()),
+        Some(value) => {
+            let got = String::from_utf8_lossy(value.as_bytes());
+            Err(HttpError::unsupported("content-encoding", "identity", &got))
+        }
+    }
+}
+
+/// Unknown fields are refused, wherever they stand.
+fn no_query(parts: &Parts) -> Result<(), HttpError> {
+    match parts.uri.query() {
+        None | Some("") => Ok(()),
+        Some(query) => Err(Error::field("query", "no query parameters", query).into()),
+    }
+}
+
+/// `?pageSize=…&pageToken=…&filter=…`, also in snake case.
+fn list_request(query: &str) -> Result<longrunning::ListOperationsRequest, HttpError> {
+    let mut message = longrunning::ListOperationsRequest {
+        name: "operations".to_owned(),
+        ..longrunning::ListOperationsRequest::default()
+    };
+    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
+        let (name, value) = pair.split_once('=').unwrap_or((pair, ""));
+        match name {
+            "pageSize" | "page_size" => {
+                message.page_size = value
+                    .parse()
+                    .map_err(|_| Error::field("page_size", "an integer, at least 0", value))?;
+            }
+            "pageToken" | "page_token" => message.page_token = value.to_owned(),
+            "filter" => message.filter = value.to_owned(),
+            _ => {
+                let expected = "pageSize, pageToken, filter";
+                return Err(Error::field("query", expected, name).into());
+            }
+        }
+    }
+    Ok(message)
+}

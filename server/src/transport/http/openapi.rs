@@ -1,0 +1,366 @@
+//! The OpenAPI document, made from the contract's descriptors and their comments.
+
+use std::collections::{BTreeMap, HashMap};
+
+use prost_reflect::{
+    Cardinality, EnumDescriptor, FieldDescriptor, FileDescriptor, Kind, MessageDescriptor,
+};
+use serde_json::{Map, Value, json};
+use vbar_proto::DESCRIPTORS;
+
+/// One HTTP binding of an RPC.
+struct Route {
+    method: &'static str,
+    path: &'static str,
+    rpc: &'static str,
+    /// The request is a JSON body, which may be left out if not required.
+    body: Option<Body>,
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Body {
+    Required,
+    Optional,
+}
+
+const ROUTES: [Route; 10] = [
+    route("post", "/v1/plans:compute", "vbar.v1.GuidanceService.ComputePlan", Body::Required),
+    route("post", "/v1/precompute", "vbar.v1.GuidanceService.Precompute", Body::Required),
+    route("post", "/v1/step", "vbar.v1.GuidanceService.Step", Body::Required),
+    bare("get", "/v1/info", "vbar.v1.GuidanceService.GetServerInfo"),
+    bare("get", "/v1/artifacts/{id}", "vbar.v1.GuidanceService.GetArtifact"),
+    bare("get", "/v1/operations", "google.longrunning.Operations.ListOperations"),
+    bare("get", "/v1/operations/{id}", "google.longrunning.Operations.GetOperation"),
+    bare("delete", "/v1/operations/{id}", "google.longrunning.Operations.DeleteOperation"),
+    route(
+        "post",
+        "/v1/operations/{id}:wait",
+        "google.longrunning.Operations.WaitOperation",
+        Body::Optional,
+    ),
+    route(
+        "post",
+        "/v1/operations/{id}:cancel",
+        "google.longrunning.Operations.CancelOperation",
+        Body::Optional,
+    ),
+];
+
+const fn route(method: &'static str, path: &'static str, rpc: &'static str, body: Body) -> Route {
+    Route { method, path, rpc, body: Some(body) }
+}
+
+const fn bare(method: &'static str, path: &'static str, rpc: &'static str) -> Route {
+    Route { method, path, rpc, body: None }
+}
+
+/// The whole document.
+pub(super) fn document() -> Value {
+    let mut schemas = Schemas::default();
+    let mut paths: BTreeMap<String, Map<String, Value>> = BTreeMap::new();
+    for route in &ROUTES {
+        let operation = operation(route, &mut schemas);
+        paths.entry(route.path.to_owned()).or_default().insert(route.method.to_owned(), operation);
+    }
+    for (path, summary, content) in [
+        ("/healthz", "Whether the process is alive.", "text/plain"),
+        ("/readyz", "Whether it will answer; 503 while it shuts down.", "text/plain"),
+        ("/metrics", "Metrics for Prometheus.", "application/openmetrics-text"),
+        ("/openapi.json", "This document.", "application/json"),
+    ] {
+        paths.entry(path.to_owned()).or_default().insert("get".to_owned(), probe(summary, content));
+    }
+    schemas.add_status();
+    json!({
+        "openapi": "3.1.0",
+        "info": {
+            "title": "vbar",
+            "version": env!("CARGO_PKG_VERSION"),
+            "description": "Guidance for spacecraft rendezvous. The messages of `vbar.v1` as \
+                canonical proto3 JSON: field names in lowerCamelCase (snake_case is accepted), \
+                64-bit integers as strings, enum values by name. Unknown fields are refused. The \
+                header `Request-Timeout-Ms` gives a deadline in milliseconds (a call that cannot keep it \
+                is answered with 504); `X-Request-Id` is echoed.",
+            "license": { "name": "Apache-2.0", "identifier": "Apache-2.0" },
+        },
+        "paths": paths,
+        "components": {
+            "schemas": schemas.by_name,
+            "parameters": {
+                "id": {
+                    "name": "id",
+                    "in": "path",
+                    "required": true,
+                    "description": "Artifact id: 64 lower-case hexadecimal digits.",
+                    "schema": { "type": "string", "pattern": "^[0-9a-f]{64}$" },
+                },
+            },
+        },
+    })
+}
+
+fn operation(route: &Route, schemas: &mut Schemas) -> Value {
+    let (service, rpc) = route.rpc.rsplit_once('.').unwrap_or_default();
+    let service = DESCRIPTORS.get_service_by_name(service).expect("it is in the contract");
+    let rpc = service.methods().find(|m| m.name() == rpc).expect("it is in the contract");
+    let mut parameters = Vec::new();
+    if route.path.contains("{id}") {
+        parameters.push(json!({ "$ref": "#/components/parameters/id" }));
+    }
+    if route.path == "/v1/operations" {
+        for (name, schema) in [
+            ("pageSize", json!({ "type": "integer", "minimum": 0, "maximum": i32::MAX })),
+            ("pageToken", json!({ "type": "string", "pattern": "^([0-9a-f]{64})?$" })),
+        ] {
+            parameters.push(json!({ "name": name, "in": "query", "schema": schema }));
+        }
+    }
+    let comments = Comments::of(&rpc.parent_file());
+    let mut operation = json!({
+        "operationId": rpc.name(),
+        "description": comments.at(rpc.path()),
+        "parameters": parameters,
+        "responses": responses(route, schemas.reference(&rpc.output())),
+    });
+    if let Some(body) = route.body {
+        operation["requestBody"] = json!({
+            "required": body == Body::Required,
+            "content": { "application/json": { "schema": schemas.reference(&rpc.input()) } },
+        });
+    }
+    operation
+}
+
+fn responses(route: &Route, answer: Value) -> Value {
+    let mut responses = Map::new();
+    let mut add = |code: &str, description: &str, schema: &Value| {
+        let content = json!({ "application/json": { "schema": schema } });
+        responses
+            .insert(code.to_owned(), json!({ "description": description, "content": content }));
+    };
+    add("200", "The answer; an infeasible problem is one too.", &answer);
+    let status = json!({ "$ref": "#/components/schemas/google.rpc.Status" });
+    let mut errors = vec![
+        ("400", "The request is at fault; every faulty field is named."),
+        ("405", "The path exists, but not for this method."),
+        ("429", "Every compute thread is busy; the details say when to ask again."),
+        ("500", "A bug of the server; the request id finds it in the log."),
+        ("503", "The artifact store does not answer, or the server is shutting down."),
+        ("504", "No certified answer was found before the deadline."),
+    ];
+    if route.path.contains("{id}") || route.path == "/v1/step" {
+        errors.push(("404", "There is no such artifact or operation."));
+    }
+    if route.body.is_some() {
+        errors.push(("408", "The body did not arrive in time."));
+        errors.push(("413", "The body is too large."));
+        errors.push(("415", "The body is not plain JSON."));
+    }
+    if route.method == "delete" {
+        errors.push(("501", "An operation has no record apart from its artifact."));
+    }
+    for (code, description) in errors {
+        add(code, description, &status);
+    }
+    Value::Object(responses)
+}
+
+fn probe(summary: &str, content: &str) -> Value {
+    let schema = if content == "application/json" {
+        json!({ "type": "object" })
+    } else {
+        json!({ "type": "string" })
+    };
+    let ok = json!({ "description": "Yes.", "content": { content: { "schema": schema } } });
+    let no = json!({
+        "description": "Not now.",
+        "content": { "text/plain": { "schema": { "type": "string" } } },
+    });
+    let wrong = json!({
+        "description": "Only GET.",
+        "content": {
+            "application/json": {
+                "schema": { "$ref": "#/components/schemas/google.rpc.Status" },
+            },
+        },
+    });
+    json!({ "description": summary, "responses": { "200": ok, "405": wrong, "503": no } })
+}
+
+/// Schemas of messages and enums, collected as they are referred to.
+#[derive(Default)]
+struct Schemas {
+    by_name: BTreeMap<String, Value>,
+}
+
+impl Schemas {
+    fn reference(&mut self, message: &MessageDescriptor) -> Value {
+        let name = message.full_name();
+        match name {
+            "google.protobuf.Empty" => return json!({ "type": "object" }),
+            "google.protobuf.Duration" => {
+                return json!({ "type": "string", "pattern": "^[0-9]{1,9}([.][0-9]{1,9})?s$" });
+            }
+            "google.protobuf.Any" => {
+                return json!({
+                    "type": "object",
+                    "properties": { "@type": { "type": "string" } },
+                    "required": ["@type"],
+                    "additionalProperties": true,
+                });
+            }
+            _ => {}
+        }
+        if !self.by_name.contains_key(name) {
+            // First a place-holder, so that a message may contain itself.
+            self.by_name.insert(name.to_owned(), Value::Null);
+            let schema = self.message(message);
+            self.by_name.insert(name.to_owned(), schema);
+        }
+        json!({ "$ref": format!("#/components/schemas/{name}") })
+    }
+
+    fn message(&mut self, message: &MessageDescriptor) -> Value {
+        let comments = Comments::of(&message.parent_file());
+        let mut description = comments.at(message.path());
+        for oneof in message.oneofs().filter(|oneof| !oneof.is_synthetic()) {
+            let names: Vec<_> = oneof.fields().map(|f| f.json_name().to_owned()).collect();
+            let comment = comments.at(oneof.path());
+            description += &format!(" At most one of {}: {comment}", names.join(", "));
+        }
+        let mut properties = Map::new();
+        for field in message.fields() {
+            let mut schema = self.field(&field);
+            schema["description"] = comments.at(field.path()).into();
+            properties.insert(field.json_name().to_owned(), schema);
+        }
+        json!({
+            "type": "object",
+            "description": description.trim(),
+            "properties": properties,
+            "additionalProperties": false,
+        })
+    }
+
+    fn field(&mut self, field: &FieldDescriptor) -> Value {
+        let kind = self.kind(&field.kind());
+        match field.cardinality() {
+            Cardinality::Repeated => json!({ "type": "array", "items": kind }),
+            Cardinality::Optional | Cardinality::Required => kind,
+        }
+    }
+
+    fn kind(&mut self, kind: &Kind) -> Value {
+        match kind {
+            Kind::Double => json!({ "type": "number", "format": "double" }),
+            Kind::Float => json!({ "type": "number", "format": "float" }),
+            Kind::Int32 | Kind::Sint32 | Kind::Sfixed32 => json!({
+                "type": "integer", "format": "int32", "minimum": i32::MIN, "maximum": i32::MAX,
+            }),
+            Kind::Uint32 | Kind::Fixed32 => json!({
+                "type": "integer", "minimum": 0, "maximum": u32::MAX,
+            }),
+            Kind::Int64 | Kind::Sint64 | Kind::Sfixed64 => {
+                json!({ "type": "string", "format": "int64", "pattern": "^-?[0-9]{1,18}$" })
+            }
+            Kind::Uint64 | Kind::Fixed64 => {
+                json!({ "type": "string", "format": "uint64", "pattern": "^[0-9]{1,18}$" })
+            }
+            Kind::Bool => json!({ "type": "boolean" }),
+            Kind::String => json!({ "type": "string" }),
+            Kind::Bytes => json!({ "type": "string", "contentEncoding": "base64" }),
+            Kind::Message(message) => self.reference(message),
+            Kind::Enum(values) => self.enumeration(values),
+        }
+    }
+
+    fn enumeration(&mut self, values: &EnumDescriptor) -> Value {
+        let name = values.full_name();
+        if !self.by_name.contains_key(name) {
+            let comments = Comments::of(&values.parent_file());
+            let mut description = comments.at(values.path());
+            for value in values.values() {
+                description += &format!(" `{}`: {}", value.name(), comments.at(value.path()));
+            }
+            let names: Vec<_> = values.values().map(|value| value.name().to_owned()).collect();
+            let schema = json!({
+                "type": "string",
+                "enum": names,
+                "description": description.trim(),
+            });
+            self.by_name.insert(name.to_owned(), schema);
+        }
+        json!({ "$ref": format!("#/components/schemas/{name}") })
+    }
+
+    /// The shape of every error.
+    fn add_status(&mut self) {
+        let status = DESCRIPTORS.get_message_by_name("google.rpc.Status");
+        self.reference(&status.expect("it is in the contract"));
+    }
+}
+
+/// The comments of one file, by the path of what they are about.
+struct Comments(HashMap<Vec<i32>, String>);
+
+impl Comments {
+    fn of(file: &FileDescriptor) -> Self {
+        let described = file.file_descriptor_proto();
+        let locations = described.source_code_info.iter().flat_map(|info| &info.location);
+        let text = |text: &str| {
+            let lines = text.lines().map(str::trim).filter(|line| !line.starts_with("buf:"));
+            lines.collect::<Vec<_>>().join(" ").trim().to_owned()
+        };
+        Self(locations.map(|l| (l.path.clone(), text(l.leading_comments()))).collect())
+    }
+
+    fn at(&self, path: &[i32]) -> String {
+        self.0.get(path).cloned().unwrap_or_default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every `$ref` of the document.
+    fn references(value: &Value, found: &mut Vec<String>) {
+        match value {
+            Value::Object(map) => {
+                for (key, value) in map {
+                    match (key.as_str(), value) {
+                        ("$ref", Value::String(target)) => found.push(target.clone()),
+                        _ => references(value, found),
+                    }
+                }
+            }
+            Value::Array(values) => values.iter().for_each(|value| references(value, found)),
+            _ => {}
+        }
+    }
+
+    #[test]
+    fn openapi_every_reference_leads_somewhere() {
+        let document = document();
+        let mut found = Vec::new();
+        references(&document, &mut found);
+        assert!(found.len() > 100);
+        for target in found {
+            let pointer = target.strip_prefix('#').expect("a local reference");
+            assert!(document.pointer(pointer).is_some_and(Value::is_object), "{target}");
+        }
+    }
+
+    #[test]
+    fn openapi_every_schema_and_field_has_the_contract_s_comment() {
+        let document = document();
+        let schemas = document["components"]["schemas"].as_object().unwrap();
+        assert!(schemas.contains_key("vbar.v1.HillPlant"));
+        for (name, schema) in schemas {
+            assert!(!schema["description"].as_str().unwrap().is_empty(), "{name}");
+            for (field, schema) in schema["properties"].as_object().into_iter().flatten() {
+                assert!(!schema["description"].as_str().unwrap().is_empty(), "{name}.{field}");
+            }
+        }
+    }
+}

@@ -1,0 +1,254 @@
+//! The door: messages become values of the mathematics, once, with every fault named by field;
+//! answers become messages. The only room that knows both `vbar_proto` and `vbar_guidance`.
+//!
+//! Nothing is repaired here. A value is taken as it is or refused; where a message leaves a choice
+//! to the server, the `.proto` file says which one is made.
+
+mod calls;
+mod controller_state;
+mod methods;
+mod types;
+mod variable_horizon;
+
+use std::fmt;
+
+pub(crate) use calls::{
+    ArtifactAnswer, ArtifactCall, Controller, DecidedStep, InfoAnswer, InfoCall, NamedBy,
+    OperationAnswer, OperationName, OperationsAnswer, OperationsCall, PlanAnswer, PlanCall,
+    PlanResult, PrecomputeCall, StepAnswer, StepCall, StreamCall,
+};
+pub(crate) use controller_state::{ControllerState, StateFault};
+pub(crate) use methods::{Artifact, PlanVerdict, Problem, SolverWork, State, Step, VerdictKind};
+pub(crate) use types::{ArtifactId, ElapsedAndState, Provenance};
+
+/// Limits on what a request may ask for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// Longest horizon.
+    pub horizon_max: usize,
+    /// Most generators of a disturbance set.
+    pub generators_max: usize,
+    /// Most state components of a general linear plant.
+    pub states_max: usize,
+    /// Most inputs of a general linear plant.
+    pub inputs_max: usize,
+    /// Longest mission, steps.
+    pub steps_max: usize,
+    /// Most rows of a polytope.
+    pub polytope_rows_max: usize,
+}
+
+impl Default for Limits {
+    /// Well above the published missions (horizon 122, 6 states, 12 generators), well below what
+    /// would occupy a compute thread for minutes.
+    fn default() -> Self {
+        Self {
+            horizon_max: 500,
+            generators_max: 48,
+            states_max: 12,
+            inputs_max: 6,
+            steps_max: 10_000,
+            polytope_rows_max: 64,
+        }
+    }
+}
+
+/// A value that can be read from a message.
+pub(crate) trait Parse: Sized {
+    /// The message.
+    type Message;
+
+    /// Reads `message`, which stands at `path`; `None` after at least one violation was recorded.
+    fn parse(message: &Self::Message, path: Path<'_>, door: &mut Door) -> Option<Self>;
+}
+
+/// A value that can be written as a message.
+pub(crate) trait Render {
+    /// The message.
+    type Message;
+
+    /// Writes it.
+    fn render(&self) -> Self::Message;
+}
+
+/// Reads a whole request.
+///
+/// # Errors
+/// Every violation found.
+pub(crate) fn parse<T: Parse>(message: &T::Message, limits: &Limits) -> Result<T, Violations> {
+    let mut door = Door { limits: *limits, violations: Vec::new() };
+    match T::parse(message, Path::ROOT, &mut door) {
+        Some(value) if door.violations.is_empty() => Ok(value),
+        _ => Err(Violations(door.violations)),
+    }
+}
+
+/// One fault of a request.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Violation {
+    /// Where: field names as in the `.proto` files, joined by dots, with indices in brackets.
+    pub(crate) path: String,
+    /// What would have been right.
+    pub(crate) expected: String,
+    /// What was found.
+    pub(crate) got: String,
+}
+
+impl fmt::Display for Violation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "expected {}, got {}", self.expected, self.got)
+    }
+}
+
+/// Every fault of a request.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Violations(pub(crate) Vec<Violation>);
+
+impl Violations {
+    /// Faults that only the mathematics saw, under the path of the method's message.
+    pub(crate) fn under(prefix: &str, faults: Vec<vbar_guidance::control::Fault>) -> Self {
+        let place = |field: &str| match (prefix, field) {
+            (prefix, "") => prefix.to_owned(),
+            ("", field) => field.to_owned(),
+            (prefix, field) => format!("{prefix}.{field}"),
+        };
+        Self(
+            faults
+                .into_iter()
+                .map(|fault| Violation {
+                    path: place(&fault.field),
+                    expected: fault.expected,
+                    got: fault.got,
+                })
+                .collect(),
+        )
+    }
+}
+
+/// What a parser needs: the limits, and the place where faults are written down.
+#[derive(Debug)]
+pub(crate) struct Door {
+    limits: Limits,
+    violations: Vec<Violation>,
+}
+
+impl Door {
+    /// Records a fault; returns `None` so that a parser can end with it.
+    fn refuse<T>(
+        &mut self,
+        path: Path<'_>,
+        expected: impl Into<String>,
+        got: impl fmt::Display,
+    ) -> Option<T> {
+        // A request of 4 MB can be wrong in 500,000 places; nobody reads more than these.
+        const VIOLATIONS_MAX: usize = 100;
+        if self.violations.len() < VIOLATIONS_MAX {
+            self.violations.push(Violation {
+                path: path.to_string(),
+                expected: expected.into(),
+                got: got.to_string(),
+            });
+        }
+        None
+    }
+
+    /// A field that must be present.
+    fn required<'m, T>(&mut self, field: &'m Option<T>, path: Path<'_>) -> Option<&'m T> {
+        match field {
+            Some(value) => Some(value),
+            None => self.refuse(path, "a value (the field is required)", "nothing"),
+        }
+    }
+
+    /// Parses a required message.
+    fn message<T: Parse>(&mut self, field: &Option<T::Message>, path: Path<'_>) -> Option<T> {
+        let message = self.required(field, path)?;
+        T::parse(message, path, self)
+    }
+
+    /// Parses a message that may be absent: `Some(None)` if it is, `None` if it is wrong.
+    #[allow(clippy::option_option, reason = "absent and wrong are different things here")]
+    fn optional<T: Parse>(
+        &mut self,
+        field: &Option<T::Message>,
+        path: Path<'_>,
+    ) -> Option<Option<T>> {
+        match field {
+            None => Some(None),
+            Some(message) => T::parse(message, path, self).map(Some),
+        }
+    }
+}
+
+/// Where a value stands in a request; text is made of it only when it is at fault.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Path<'a> {
+    parent: Option<&'a Path<'a>>,
+    segment: Segment,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Segment {
+    Root,
+    Field(&'static str),
+    Index(usize),
+}
+
+impl Path<'_> {
+    /// The request itself.
+    const ROOT: Self = Self { parent: None, segment: Segment::Root };
+
+    /// A field of the message at this path.
+    fn field(&self, name: &'static str) -> Path<'_> {
+        Path { parent: Some(self), segment: Segment::Field(name) }
+    }
+
+    /// An element of the list at this path.
+    fn index(&self, index: usize) -> Path<'_> {
+        Path { parent: Some(self), segment: Segment::Index(index) }
+    }
+}
+
+impl fmt::Display for Path<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Some(parent) = self.parent else { return Ok(()) };
+        parent.fmt(f)?;
+        match self.segment {
+            Segment::Root => Ok(()),
+            Segment::Field(name) if parent.parent.is_none() => f.write_str(name),
+            Segment::Field(name) => write!(f, ".{name}"),
+            Segment::Index(index) => write!(f, "[{index}]"),
+        }
+    }
+}
+
+/// Counts on the wire are `int32`; ours never come near its end, and say so if they do.
+fn count(value: usize) -> i32 {
+    i32::try_from(value).unwrap_or(i32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn path_reads_like_the_message() {
+        let problem = Path::ROOT.field("problem");
+        let method = problem.field("variable_horizon");
+        let gain = method.field("gain");
+        let poles = gain.field("poles");
+        let values = poles.field("values");
+        let poles = values.index(3).to_string();
+        assert_eq!(poles, "problem.variable_horizon.gain.poles.values[3]");
+        assert_eq!(Path::ROOT.to_string(), "");
+    }
+
+    #[test]
+    fn violations_are_bounded() {
+        let mut door = Door { limits: Limits::default(), violations: Vec::new() };
+        for i in 0..1000 {
+            let _: Option<()> = door.refuse(Path::ROOT.index(i), "less", "more");
+        }
+        assert_eq!(door.violations.len(), 100);
+    }
+}

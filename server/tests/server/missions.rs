@@ -1,0 +1,99 @@
+//! The missions that tests and benchmarks fly, as canonical JSON.
+
+use prost_reflect::{DynamicMessage, MessageDescriptor};
+use serde_json::{Value, json};
+use vbar_proto::{DESCRIPTORS, v1};
+
+/// EnviSat as in `simulator/missions/envisat.json`; [Quartullo2025a, sec. V.B] does not give the
+/// docking geometry, that file says where this one comes from.
+pub(crate) fn envisat() -> Value {
+    json!({ "variableHorizon": {
+        "hill": {
+            "semiMajorAxisM": 7_140_000.0,
+            "sampleAngleDeg": 0.351_562_5,
+            "accelerationMaxMS2": 0.025,
+            "frame": "FRAME_RTN",
+            "capturePointM": CAPTURE_POINT_M,
+            "cone": { "halfAngleDeg": 25.0 },
+            "rotation": { "spin": { "angularVelocityDegS": [
+                -0.012_886_816_699_805_652, -1.134_039_869_582_897_3, -0.605_680_384_890_865_5
+            ] } },
+            "disturbance": { "misalignment": { "angleMaxDeg": 1.0 } },
+        },
+        "scheme": "VARIABLE_HORIZON_SCHEME_ADAPTIVE_TERMINAL",
+        "gain": { "poles": { "values": [0.6, 0.6, 0.6, 0.5, 0.5, 0.5] } },
+        "fuelWeight": 5.0,
+        "search": "HORIZON_SEARCH_LOCAL",
+        "horizonMax": 60,
+    } })
+}
+
+const CAPTURE_POINT_M: [f64; 3] =
+    [1.474_154_351_327_17, -0.143_966_243_873_253_66, 0.236_944_443_041_396_6];
+
+/// 50 m out on the docking axis, at rest relative to the rotating axis.
+pub(crate) fn envisat_start() -> Value {
+    json!({
+        "relative": {
+            "frame": "FRAME_RTN",
+            "positionM": [49.138_478_377_572_34, -4.798_874_795_775_122, 7.898_148_101_379_887_5],
+            "velocityMS": [
+                -0.207_055_376_102_783_18, -0.517_672_169_955_497_7, 0.973_663_964_514_608_1
+            ],
+        },
+        "elapsedS": 0.0,
+    })
+}
+
+/// The double integrator of [Quartullo2025b, sec. 4.1].
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn double_integrator() -> Value {
+    json!({ "variableHorizon": {
+        "linear": {
+            "a": { "rows": 2, "columns": 2, "values": [1.0, 1.0, 0.0, 1.0] },
+            "b": { "rows": 2, "columns": 1, "values": [0.0, 1.0] },
+            "inputLower": [-2.0],
+            "inputUpper": [2.0],
+            "stateSet": {
+                "normals": {
+                    "rows": 4, "columns": 2,
+                    "values": [1.0, 0.0, -1.0, 0.0, 0.0, 1.0, 0.0, -1.0],
+                },
+                "offsets": [25.0, 25.0, 2.0, 2.0],
+            },
+            "disturbance": { "box": { "halfWidthNd": [0.1, 0.4] } },
+        },
+        "scheme": "VARIABLE_HORIZON_SCHEME_ADAPTIVE_TERMINAL",
+        "gain": { "explicit": { "rows": 1, "columns": 2, "values": [-0.06, -0.5] } },
+        "fuelWeight": 1.0,
+        "trackingWeight": 0.02,
+        "search": "HORIZON_SEARCH_ENUMERATION",
+        "horizonMax": 60,
+    } })
+}
+
+/// The message that `json` writes.
+pub(crate) fn message<M: prost::Message + prost::Name + Default>(json: Value) -> M {
+    let message = DynamicMessage::deserialize(descriptor::<M>(), json);
+    message.expect("JSON of this message").transcode_to().expect("the same contract")
+}
+
+fn descriptor<M: prost::Name>() -> MessageDescriptor {
+    DESCRIPTORS.get_message_by_name(&M::full_name()).expect("a message of the contract")
+}
+
+/// The state that `prediction` says will be measured next if no disturbance acts.
+pub(crate) fn predicted(answer: &v1::StepResponse, elapsed_s: f64) -> Value {
+    let prediction = answer.prediction.as_ref().expect("it was asked for");
+    let row = |matrix: &Option<v1::Matrix>| {
+        matrix.as_ref().expect("a spacecraft's").values[3..6].to_vec()
+    };
+    json!({
+        "relative": {
+            "frame": "FRAME_RTN",
+            "positionM": row(&prediction.positions_m),
+            "velocityMS": row(&prediction.velocities_m_s),
+        },
+        "elapsedS": elapsed_s,
+    })
+}
