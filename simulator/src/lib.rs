@@ -1,1 +1,45 @@
-//! vbar simulator.
+//! The reference simulator of vbar: flies missions against a node and shows what comes out.
+//!
+//! It is a customer like any other. It knows the service through `vbar-client` alone, never the
+//! mathematics behind it: plant, scaling, docking cone and reference motion are written a second
+//! time, from the papers, so that one wrong sign cannot hide in both.
+//!
+//! A mission file ([`Mission`]) says what the service is asked and against which truth it is
+//! flown; [`simulate`] flies it, many runs at once; the [`Report`] holds every trace, the
+//! statistics and the published figures; [`draw`] makes pictures of it.
+
+mod campaign;
+mod mission;
+mod pictures;
+mod plant;
+mod report;
+
+pub use campaign::{
+    Campaign, Flight, Progress, ProgressBar, RunOptions, SchemeChoice, Silent, SimulationError,
+    SweepPoint,
+    flight::{Outcome, Sample, Step, VIOLATION_TOLERANCE_ND},
+    search::SearchComparison,
+    simulate,
+};
+pub use mission::{Mission, MissionError, Published, RUNS_MAX};
+pub use pictures::{PictureError, draw};
+pub use report::{Report, Statistics, Summary};
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::DVector;
+
+    /// The cases of one file of reference numbers (see `tests/golden/variable_horizon`).
+    pub(crate) fn golden_cases(file: &str) -> Vec<serde_json::Value> {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/variable_horizon");
+        let path = format!("{folder}/{file}");
+        let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
+        serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
+    }
+
+    /// A list of numbers.
+    pub(crate) fn vector(json: &serde_json::Value) -> DVector<f64> {
+        let numbers = json.as_array().expect("a list").iter();
+        DVector::from_iterator(numbers.len(), numbers.map(|n| n.as_f64().expect("a number")))
+    }
+}

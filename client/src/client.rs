@@ -1,0 +1,284 @@
+//! One call, one method.
+
+use std::time::Duration;
+
+use prost::{Message, Name};
+use tokio::time::Instant;
+use tonic::{
+    Code, Request, Response, Status,
+    transport::{Channel, Endpoint},
+};
+use vbar_proto::{
+    google::longrunning::{
+        GetOperationRequest, Operation, WaitOperationRequest, operation,
+        operations_client::OperationsClient,
+    },
+    v1::{
+        Artifact, ComputePlanRequest, ComputePlanResponse, GetArtifactRequest,
+        GetServerInfoRequest, GetServerInfoResponse, PrecomputeRequest, PrecomputeResponse,
+        Problem, StepRequest, StepResponse, guidance_service_client::GuidanceServiceClient,
+        step_stream_request::Controller,
+    },
+};
+
+use crate::{ClosedLoop, Error, retry::Attempts};
+
+/// A node is asked to hold one wait for at most this long; then it is asked again.
+const WAIT_MAX: Duration = Duration::from_secs(10);
+/// Shortest and longest pause between two looks at an operation.
+const LOOK_PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_secs(1));
+
+/// How calls are made.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Longest time for one call, every attempt and pause included. The node is told and stops
+    /// computing when it has passed.
+    pub deadline: Duration,
+    /// The same for [`Client::precompute`], which thinks long once.
+    pub precompute_deadline: Duration,
+    /// Longest time to reach the node once.
+    pub connect_timeout: Duration,
+    /// Most attempts of one call, the first included; 0 counts as 1.
+    pub attempts_max: u32,
+    /// Largest message sent or accepted.
+    pub message_bytes_max: usize,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            deadline: Duration::from_secs(30),
+            precompute_deadline: Duration::from_secs(3600),
+            connect_timeout: Duration::from_secs(5),
+            attempts_max: 5,
+            message_bytes_max: 16 << 20,
+        }
+    }
+}
+
+/// A connection to one node; cheap to clone, and all clones share the connection.
+#[derive(Debug, Clone)]
+pub struct Client {
+    pub(crate) guidance: GuidanceServiceClient<Channel>,
+    operations: OperationsClient<Channel>,
+    pub(crate) options: Options,
+}
+
+impl Client {
+    /// Connects to the node at `url`, such as `http://127.0.0.1:7440`.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for a URL that is not `http://host:port`; `UNAVAILABLE` when nothing
+    /// answers there after all attempts.
+    pub async fn connect(url: &str, options: Options) -> Result<Self, Error> {
+        let endpoint = endpoint(url, &options)?;
+        let mut attempts = Attempts::new(options.attempts_max, Instant::now() + options.deadline);
+        let channel = loop {
+            let reached = async {
+                endpoint.connect().await.map_err(|fault| {
+                    let mut error = Error::from(Status::from_error(fault.into()));
+                    error.message = format!("cannot reach {url}: {}", error.message);
+                    error
+                })
+            };
+            match attempts.bounded(reached).await {
+                Ok(channel) => break channel,
+                Err(error) => attempts.pause_after(error).await?,
+            }
+        };
+        let size = options.message_bytes_max;
+        Ok(Self {
+            guidance: GuidanceServiceClient::new(channel.clone())
+                .max_decoding_message_size(size)
+                .max_encoding_message_size(size),
+            operations: OperationsClient::new(channel)
+                .max_decoding_message_size(size)
+                .max_encoding_message_size(size),
+            options,
+        })
+    }
+
+    /// The same connection with another deadline for each call.
+    #[must_use]
+    pub fn with_deadline(&self, deadline: Duration) -> Self {
+        let mut client = self.clone();
+        client.options.deadline = deadline;
+        client
+    }
+
+    /// Computes a plan to fly without further optimisation, or says why there is none.
+    ///
+    /// # Errors
+    /// [`Error`], as every call.
+    pub async fn plan(&self, request: ComputePlanRequest) -> Result<ComputePlanResponse, Error> {
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.compute_plan(request).await }
+        })
+        .await
+    }
+
+    /// Decides the next command. The answer's `controller_state` goes into the next request.
+    ///
+    /// # Errors
+    /// [`Error`], as every call.
+    pub async fn step(&self, request: StepRequest) -> Result<StepResponse, Error> {
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.step(request).await }
+        })
+        .await
+    }
+
+    /// A closed loop from its first step: the controller is sent once, then measurements only.
+    ///
+    /// The stream is opened by the first measurement, so a refused controller shows there.
+    ///
+    /// # Errors
+    /// None today: whatever can fail does so in [`ClosedLoop::step`].
+    pub async fn closed_loop(&self, controller: Controller) -> Result<ClosedLoop, Error> {
+        Ok(ClosedLoop::new(self.clone(), controller))
+    }
+
+    /// Makes an artifact and waits until it is done, within [`Options::precompute_deadline`].
+    ///
+    /// # Errors
+    /// [`Error`], as every call, and whatever ended the operation.
+    pub async fn precompute(&self, problem: Problem) -> Result<PrecomputeResponse, Error> {
+        let deadline = Instant::now() + self.options.precompute_deadline;
+        // No request id: the problem's own digest already makes a repeated call the same job.
+        let request = PrecomputeRequest { problem: Some(problem), ..PrecomputeRequest::default() };
+        let within = self.options.deadline.min(self.options.precompute_deadline);
+        let operation = self
+            .call(within, request, |request| {
+                let mut guidance = self.guidance.clone();
+                async move { guidance.precompute(request).await }
+            })
+            .await?;
+        finished(self.wait(operation, deadline).await?)
+    }
+
+    /// Summary of an artifact that a precompute made.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` if the node does not have it; [`Error`], as every call.
+    pub async fn artifact(&self, artifact_id: &str) -> Result<Artifact, Error> {
+        let request = GetArtifactRequest { artifact_id: artifact_id.to_owned() };
+        let response = self
+            .call(self.options.deadline, request, |request| {
+                let mut guidance = self.guidance.clone();
+                async move { guidance.get_artifact(request).await }
+            })
+            .await?;
+        response.artifact.ok_or_else(|| Error::broken_contract("no artifact in it"))
+    }
+
+    /// Build, methods and limits of the node.
+    ///
+    /// # Errors
+    /// [`Error`], as every call.
+    pub async fn server_info(&self) -> Result<GetServerInfoResponse, Error> {
+        self.call(self.options.deadline, GetServerInfoRequest {}, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.get_server_info(request).await }
+        })
+        .await
+    }
+
+    /// Follows `operation` until it is done.
+    async fn wait(&self, mut operation: Operation, deadline: Instant) -> Result<Operation, Error> {
+        let mut can_wait = true;
+        let mut pause = LOOK_PAUSE.0;
+        while !operation.done {
+            let left = Attempts::new(1, deadline).time_left()?;
+            if can_wait {
+                match self.wait_once(&operation.name, left).await {
+                    Ok(latest) => operation = latest,
+                    // AIP-151 makes waiting optional for a node; looking is not.
+                    Err(error) if error.code == Code::Unimplemented => can_wait = false,
+                    Err(error) => return Err(error),
+                }
+            } else {
+                tokio::time::sleep(pause.min(left)).await;
+                pause = (pause * 2).min(LOOK_PAUSE.1);
+                operation = self.look(&operation.name, left).await?;
+            }
+        }
+        Ok(operation)
+    }
+
+    async fn wait_once(&self, name: &str, left: Duration) -> Result<Operation, Error> {
+        // A shorter wait than the call's own deadline, so that "not done yet" is an answer.
+        let wait = left.min(WAIT_MAX).min(self.options.deadline).mul_f64(0.8);
+        let timeout = prost_types::Duration::try_from(wait).ok();
+        let request = WaitOperationRequest { name: name.to_owned(), timeout };
+        self.call(left.min(self.options.deadline), request, |request| {
+            let mut operations = self.operations.clone();
+            async move { operations.wait_operation(request).await }
+        })
+        .await
+    }
+
+    async fn look(&self, name: &str, left: Duration) -> Result<Operation, Error> {
+        let request = GetOperationRequest { name: name.to_owned() };
+        self.call(left.min(self.options.deadline), request, |request| {
+            let mut operations = self.operations.clone();
+            async move { operations.get_operation(request).await }
+        })
+        .await
+    }
+
+    /// One call: deadline, attempts, pauses.
+    async fn call<Q: Clone, A, F>(
+        &self,
+        within: Duration,
+        request: Q,
+        send: impl Fn(Request<Q>) -> F,
+    ) -> Result<A, Error>
+    where
+        F: Future<Output = Result<Response<A>, Status>>,
+    {
+        let mut attempts = Attempts::new(self.options.attempts_max, Instant::now() + within);
+        loop {
+            let mut message = Request::new(request.clone());
+            message.set_timeout(attempts.time_left()?);
+            let answer = async { send(message).await.map_err(Error::from) };
+            match attempts.bounded(answer).await {
+                Ok(response) => return Ok(response.into_inner()),
+                Err(error) => attempts.pause_after(error).await?,
+            }
+        }
+    }
+}
+
+fn endpoint(url: &str, options: &Options) -> Result<Endpoint, Error> {
+    let refused = |why: String| {
+        Error::local(Code::InvalidArgument, format!("{why}; a node's URL is http://host:port"))
+    };
+    let uri: http::Uri =
+        url.parse().map_err(|fault| refused(format!("{url:?} is not a URL: {fault}")))?;
+    match uri.scheme_str() {
+        Some("http") => {}
+        Some(other) => return Err(refused(format!("{other}:// is not spoken by this client"))),
+        None => return Err(refused(format!("{url:?} has no scheme"))),
+    }
+    if uri.port_u16().is_none() || uri.path() != "/" || uri.query().is_some() {
+        return Err(refused(format!("{url:?} has no port, or something after it")));
+    }
+    // A step is one small message and one small answer: waiting to fill a packet only delays.
+    Ok(Endpoint::from(uri).tcp_nodelay(true).connect_timeout(options.connect_timeout))
+}
+
+/// Result of a finished precompute.
+fn finished(operation: Operation) -> Result<PrecomputeResponse, Error> {
+    let packed = match operation.result {
+        Some(operation::Result::Response(packed)) => packed,
+        Some(operation::Result::Error(status)) => return Err(status.into()),
+        None => return Err(Error::broken_contract("a finished operation without a result")),
+    };
+    if packed.type_url != PrecomputeResponse::type_url() {
+        return Err(Error::broken_contract(&format!("a precompute gave a {}", packed.type_url)));
+    }
+    PrecomputeResponse::decode(packed.value.as_slice())
+        .map_err(|fault| Error::broken_contract(&format!("malformed precompute result: {fault}")))
+}
