@@ -1,2 +1,109 @@
 //! The `vbar` command.
-fn main() {}
+//!
+//! Results go to standard output, everything else to standard error. Exit codes are those of
+//! `sysexits.h`: 64 for a wrong command line or configuration, 65 for a file that makes no sense,
+//! 69 for a node that does not answer, 70 for a fault of ours.
+
+mod calls;
+mod failure;
+mod json;
+mod log;
+mod serve;
+mod session;
+mod simulate;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use failure::{Failure, USAGE};
+
+/// Guidance-as-a-service for spacecraft rendezvous.
+///
+/// A node answers three kinds of question over gRPC and JSON: plan (think once, fly without asking
+/// again), step (decide the next command now), precompute (think long, so that steps are fast).
+/// Try it: `vbar simulate simulator/missions/envisat.json`
+#[derive(Debug, Parser)]
+#[command(version, arg_required_else_help = true)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    log: log::LogArguments,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run a node that answers over the network
+    Serve(serve::ServeArguments),
+    /// Fly a mission many times against a node and report what comes out
+    Simulate(simulate::SimulateArguments),
+    /// Compute a plan for a mission's first state and print it as JSON
+    Plan(calls::PlanArguments),
+    /// Decide one command: a StepRequest as JSON in, the StepResponse as JSON out
+    Step(calls::StepArguments),
+    /// Make a mission's artifact on a node and print its summary as JSON
+    Precompute(calls::PrecomputeArguments),
+    /// Ask whether a node will answer; exit code 69 if not
+    Health(calls::HealthArguments),
+}
+
+fn main() -> ExitCode {
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(fault) => {
+            let code = if fault.use_stderr() { USAGE } else { 0 };
+            // Nobody is left to tell when the terminal is gone.
+            let _ = fault.print();
+            return ExitCode::from(code);
+        }
+    };
+    let filter = if matches!(arguments.command, Command::Serve(_)) { "info" } else { "warn" };
+    match log::start(&arguments.log, filter).and_then(|()| run(arguments.command)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("vbar: {failure}");
+            ExitCode::from(failure.code)
+        }
+    }
+}
+
+fn run(command: Command) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|fault| Failure::ours(format!("no threads: {fault}")))?;
+    runtime.block_on(async {
+        match command {
+            Command::Serve(arguments) => serve::serve(arguments).await,
+            Command::Simulate(arguments) => simulate::simulate(arguments).await,
+            Command::Plan(arguments) => calls::plan(arguments).await,
+            Command::Step(arguments) => calls::step(arguments).await,
+            Command::Precompute(arguments) => calls::precompute(arguments).await,
+            Command::Health(arguments) => calls::health(arguments).await,
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn arguments_are_well_formed() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn every_argument_has_a_help_text() {
+        let command = Arguments::command();
+        for subcommand in command.get_subcommands() {
+            for argument in subcommand.get_arguments() {
+                let name = (subcommand.get_name(), argument.get_id());
+                assert!(argument.get_help().is_some(), "{name:?}");
+            }
+        }
+    }
+}

@@ -8,6 +8,9 @@ use tonic::{
     Code, Request, Response, Status,
     transport::{Channel, Endpoint},
 };
+use tonic_health::pb::{
+    HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient,
+};
 use vbar_proto::{
     google::longrunning::{
         GetOperationRequest, Operation, WaitOperationRequest, operation,
@@ -61,6 +64,7 @@ impl Default for Options {
 pub struct Client {
     pub(crate) guidance: GuidanceServiceClient<Channel>,
     operations: OperationsClient<Channel>,
+    health: HealthClient<Channel>,
     pub(crate) options: Options,
 }
 
@@ -91,6 +95,7 @@ impl Client {
             guidance: GuidanceServiceClient::new(channel.clone())
                 .max_decoding_message_size(size)
                 .max_encoding_message_size(size),
+            health: HealthClient::new(channel.clone()),
             operations: OperationsClient::new(channel)
                 .max_decoding_message_size(size)
                 .max_encoding_message_size(size),
@@ -183,6 +188,20 @@ impl Client {
             async move { guidance.get_server_info(request).await }
         })
         .await
+    }
+
+    /// The node says that it will answer; false while it starts or drains.
+    ///
+    /// # Errors
+    /// [`Error`], as every call.
+    pub async fn is_serving(&self) -> Result<bool, Error> {
+        let response = self
+            .call(self.options.deadline, HealthCheckRequest::default(), |request| {
+                let mut health = self.health.clone();
+                async move { health.check(request).await }
+            })
+            .await?;
+        Ok(response.status() == ServingStatus::Serving)
     }
 
     /// Follows `operation` until it is done.

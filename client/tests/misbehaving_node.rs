@@ -430,6 +430,19 @@ async fn answer_larger_than_allowed_is_refused() {
 }
 
 #[tokio::test]
+async fn health_is_what_the_node_says() {
+    let (reporter, service) = tonic_health::server::health_reporter();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    let server = Server::builder().add_service(service);
+    tokio::spawn(server.serve_with_incoming(TcpListenerStream::new(listener)));
+    let client = Client::connect(&url, Options::default()).await.unwrap();
+    assert!(client.is_serving().await.unwrap());
+    reporter.set_service_status("", tonic_health::ServingStatus::NotServing).await;
+    assert!(!client.is_serving().await.unwrap());
+}
+
+#[tokio::test]
 async fn artifact_missing_from_the_answer_breaks_the_contract() {
     let error = connected(&Scripted::default()).await.artifact("a1").await.unwrap_err();
     assert_eq!(error.code, Code::Internal);

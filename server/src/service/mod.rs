@@ -17,11 +17,12 @@ use vbar_guidance::{
     control::{Certificate, PrepareError, StepError},
 };
 
+pub(crate) use crate::compute::Timed;
 pub(crate) use error::{Code, Error};
 pub(crate) use session::{Session, SessionAnswer};
 
 use crate::{
-    compute::{Compute, Timed},
+    compute::Compute,
     store::{ArtifactStore, Put},
     telemetry::{Metrics, OutcomeLabels},
     wire::{

@@ -1,1 +1,3 @@
-//! System tests.
+//! What the tests of the whole system share: the [`tidy`] rules.
+
+pub mod tidy;

@@ -11,8 +11,7 @@ use vbar_proto::{
 
 use super::{Draining, Grpc, request_id, status};
 use crate::{
-    compute::Timed,
-    service::{Call, Code, Error, Service, Session, SessionAnswer},
+    service::{Call, Code, Error, Service, Session, SessionAnswer, Timed},
     telemetry::{OutcomeLabels, RequestId},
     transport::{SERVER_TIMING, server_timing},
     wire::{self, Render as _, StreamCall},

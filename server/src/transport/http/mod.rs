@@ -20,8 +20,7 @@ use vbar_proto::{google::longrunning, v1};
 
 use super::{SERVER_TIMING, TransportOptions, deadline_fault, server_timing};
 use crate::{
-    compute::Timed,
-    service::{Call, Code, Error, Service},
+    service::{Call, Code, Error, Service, Timed},
     telemetry::RequestId,
     wire::{NamedBy, Parse, Render, parse},
 };

@@ -1,0 +1,155 @@
+//! `vbar simulate`.
+
+use std::{
+    num::NonZeroUsize,
+    path::{Path, PathBuf},
+};
+
+use clap::{Args, ValueEnum};
+use vbar_client::v1::HorizonSearch;
+use vbar_simulator::{Mission, ProgressBar, Report, RunOptions, SchemeChoice, draw};
+
+use crate::{
+    failure::Failure,
+    json,
+    session::{NodeArguments, Session},
+};
+
+/// The report goes to standard output; pictures and traces go to a folder, whose files are named
+/// on standard error.
+#[derive(Debug, Args)]
+pub(crate) struct SimulateArguments {
+    /// Mission file, such as simulator/missions/envisat.json
+    #[arg(value_name = "MISSION")]
+    mission: PathBuf,
+    #[command(flatten)]
+    node: NodeArguments,
+    /// Controller instead of the mission's own: adaptive-terminal, fixed-terminal,
+    /// tube-optimal-control, nominal, or all that the mission compares
+    #[arg(long, value_name = "SCHEME")]
+    scheme: Option<SchemeChoice>,
+    /// How the horizon is searched instead of the mission's own way
+    #[arg(long, value_name = "SEARCH")]
+    search: Option<Search>,
+    /// Number of runs [default: the mission's]
+    #[arg(long, value_name = "N")]
+    runs: Option<u32>,
+    /// Start of every stream of chance: the same seed flies the same runs
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    seed: u64,
+    /// Runs in flight at once [default: 16, at most what the node computes at once]
+    #[arg(long, value_name = "N")]
+    concurrency: Option<NonZeroUsize>,
+    /// Fly a named variant of the mission
+    #[arg(long, value_name = "NAME")]
+    variant: Option<String>,
+    /// Turn the thrust by these angles about R, T and N, in degrees, instead of the mission's
+    /// disturbance
+    #[arg(
+        long,
+        value_name = "R,T,N",
+        value_delimiter = ',',
+        num_args = 3,
+        allow_negative_numbers = true
+    )]
+    misalignment_deg: Option<Vec<f64>>,
+    /// Ask for every step with both searches and count the answers that differ
+    #[arg(long)]
+    compare_search: bool,
+    /// Sweep the weight of fuel over these values
+    #[arg(long, value_name = "W,W,...", value_delimiter = ',')]
+    fuel_weights: Vec<f64>,
+    /// How to print the report
+    #[arg(long, value_name = "FORMAT", default_value = "table")]
+    format: Format,
+    /// Folder for pictures, traces and the JSON report [default: out/NAME-OF-THE-MISSION]
+    #[arg(long, value_name = "DIRECTORY")]
+    out: Option<PathBuf>,
+    /// Only print the report: no pictures, and none of the runs that only they need
+    #[arg(long, conflicts_with = "out")]
+    no_pictures: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Search {
+    /// From a guess to the nearest feasible horizon, then downhill
+    Local,
+    /// Every horizon that could still be better
+    Enumeration,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Format {
+    /// For people
+    Table,
+    /// For programs
+    Json,
+}
+
+/// Flies a mission and reports.
+pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure> {
+    let mission =
+        Mission::load(&arguments.mission).map_err(|fault| Failure::data(fault.to_string()))?;
+    let options = options(&arguments)?;
+    let session = Session::open(&arguments.node).await?;
+    let progress = ProgressBar::default();
+    let flown = vbar_simulator::simulate(&session.client, &mission, &options, &progress).await;
+    session.close().await;
+    let report = flown.map_err(failure)?;
+    match arguments.format {
+        Format::Table => json::print(&report.table())?,
+        Format::Json => json::print(&format!("{:#}", report.json()))?,
+    }
+    if !arguments.no_pictures {
+        let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
+        tell_pictures(&mission, &report, &folder)?;
+    }
+    Ok(())
+}
+
+fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
+    let misalignment_deg = match arguments.misalignment_deg.as_deref() {
+        None => None,
+        Some(&[r, t, n]) => Some([r, t, n]),
+        Some(other) => {
+            let message = format!("--misalignment-deg: three angles, got {}", other.len());
+            return Err(Failure::usage(message));
+        }
+    };
+    Ok(RunOptions {
+        scheme: arguments.scheme,
+        search: arguments.search.map(|search| match search {
+            Search::Local => HorizonSearch::Local,
+            Search::Enumeration => HorizonSearch::Enumeration,
+        }),
+        runs: arguments.runs,
+        seed: arguments.seed,
+        concurrency: arguments.concurrency,
+        variant: arguments.variant.clone(),
+        misalignment_deg,
+        compare_search: arguments.compare_search,
+        fuel_weights: arguments.fuel_weights.clone(),
+        with_pictures: !arguments.no_pictures,
+    })
+}
+
+fn tell_pictures(mission: &Mission, report: &Report, folder: &Path) -> Result<(), Failure> {
+    let drawn = draw(mission, report, folder)
+        .map_err(|fault| Failure::cannot_write(format!("{}: {fault}", folder.display())))?;
+    eprintln!("{} files in {}:", drawn.len(), folder.display());
+    for path in drawn {
+        eprintln!("  {}", path.display());
+    }
+    Ok(())
+}
+
+fn failure(error: vbar_simulator::SimulationError) -> Failure {
+    use vbar_simulator::SimulationError as Error;
+    let message = error.to_string();
+    match error {
+        Error::Options(_) => Failure::usage(message),
+        Error::Client { run, source } => Failure::from(source).in_run(run),
+        Error::Mission(_) | Error::NoStart { .. } => Failure::data(message),
+        Error::Answer { .. } | Error::Task(_) => Failure::ours(message),
+    }
+}

@@ -1,0 +1,269 @@
+//! The command as its users see it: processes, exit codes, standard streams.
+
+use std::{
+    io::{BufRead as _, BufReader, Write as _},
+    path::PathBuf,
+    process::{Child, Command, Output, Stdio},
+    time::{Duration, Instant},
+};
+
+use serde_json::{Value, json};
+use vbar_client::{
+    Client, Code, Options,
+    v1::{LinearState, Measurement, measurement, step_stream_request::Controller},
+};
+use vbar_simulator::Mission;
+
+fn vbar(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_vbar"));
+    command.args(arguments).stdin(Stdio::null());
+    // What the machine that runs the tests has set must not change them.
+    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("VBAR_")) {
+        command.env_remove(name);
+    }
+    command
+}
+
+fn output(arguments: &[&str]) -> Output {
+    vbar(arguments).output().unwrap()
+}
+
+fn mission(name: &str) -> String {
+    let path: PathBuf =
+        [env!("CARGO_MANIFEST_DIR"), "..", "simulator", "missions", name].iter().collect();
+    path.to_str().unwrap().to_owned()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+/// A node in a process of its own; killed when dropped.
+struct Process {
+    child: Child,
+    url: String,
+}
+
+impl Process {
+    fn start(arguments: &[&str]) -> Self {
+        let mut command = vbar(&["serve", "--listen", "127.0.0.1:0", "--log", "warn"]);
+        let mut child = command.args(arguments).stdout(Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let url = line.trim().strip_prefix("listening on ").expect(&line).to_owned();
+        Self { child, url }
+    }
+
+    fn signal(&self, name: &str) {
+        let pid = self.child.id().to_string();
+        assert!(Command::new("kill").args([name, &pid]).status().unwrap().success());
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // It may have ended already, as some tests want it to.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A first step of the double integrator, as JSON.
+fn first_step() -> Value {
+    let text = std::fs::read_to_string(mission("double_integrator.json")).unwrap();
+    let mission: Value = serde_json::from_str(&text).unwrap();
+    json!({
+        "problem": mission["problem"],
+        "measurement": { "linear": { "components": [20.0, 0.0] } },
+    })
+}
+
+fn step_with(input: &str, arguments: &[&str]) -> Output {
+    let mut command = vbar(&["step"]);
+    let mut child = command
+        .args(arguments)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    child.stdin.take().unwrap().write_all(input.as_bytes()).unwrap();
+    child.wait_with_output().unwrap()
+}
+
+#[test]
+fn command_line_that_is_wrong_exits_64() {
+    for arguments in [&["serv"][..], &["serve", "--prot", "1"], &["simulate"], &[]] {
+        assert_eq!(output(arguments).status.code(), Some(64), "{arguments:?}");
+    }
+    assert_eq!(output(&["--help"]).status.code(), Some(0));
+}
+
+#[test]
+fn serve_bad_configuration_exits_64_and_names_every_fault() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("vbar.toml");
+    std::fs::write(&file, "horizon_max = 0\n").unwrap();
+    let file = file.to_str().unwrap();
+    let arguments = ["serve", "--listen", "0.0.0.0:0", "--config", file];
+    let ended = vbar(&arguments)
+        .env("VBAR_COMPUTE_THREADS", "0")
+        .env("VBAR_LISTN", "127.0.0.1:1")
+        .output()
+        .unwrap();
+    assert_eq!(ended.status.code(), Some(64));
+    let said = text(&ended.stderr);
+    for part in ["loopback", "horizon_max", "VBAR_LISTN"] {
+        assert!(said.contains(part), "{part} is not in {said}");
+    }
+    let ended = vbar(&arguments).env("VBAR_COMPUTE_THREADS", "0").output().unwrap();
+    assert!(text(&ended.stderr).contains("compute_threads"));
+}
+
+#[test]
+fn serve_check_config_starts_nothing() {
+    let good = output(&["serve", "--check-config"]);
+    assert_eq!((good.status.code(), text(&good.stderr)), (Some(0), String::new()));
+    let bad = output(&["serve", "--check-config", "--config", "/nowhere/vbar.toml"]);
+    assert_eq!(bad.status.code(), Some(64));
+    assert!(text(&bad.stderr).contains("/nowhere/vbar.toml"));
+}
+
+#[test]
+fn serve_answers_until_it_is_told_to_stop() {
+    for signal in ["-TERM", "-INT"] {
+        let mut node = Process::start(&[]);
+        let healthy = output(&["health", "--server", &node.url]);
+        assert_eq!((healthy.status.code(), text(&healthy.stdout)), (Some(0), "serving\n".into()));
+        node.signal(signal);
+        assert_eq!(node.child.wait().unwrap().code(), Some(0), "{signal}");
+    }
+}
+
+#[test]
+fn serve_port_in_use_is_named() {
+    let node = Process::start(&[]);
+    let taken = node.url.trim_start_matches("http://");
+    let ended = output(&["serve", "--listen", taken]);
+    assert_eq!(ended.status.code(), Some(69));
+    assert!(text(&ended.stderr).contains(taken), "{}", text(&ended.stderr));
+}
+
+#[test]
+fn health_of_nobody_exits_69_in_time() {
+    let started = Instant::now();
+    let ended = output(&["health", "--server", "http://127.0.0.1:1"]);
+    assert_eq!(ended.status.code(), Some(69));
+    assert!(started.elapsed() < Duration::from_secs(10));
+}
+
+#[test]
+fn step_reads_json_and_prints_json() {
+    let node = Process::start(&[]);
+    let input = first_step().to_string();
+    let own = step_with(&input, &[]);
+    let other = step_with(&input, &["--server", &node.url]);
+    assert_eq!(own.status.code(), Some(0), "{}", text(&own.stderr));
+    assert_eq!(text(&own.stdout), text(&other.stdout), "two nodes, two answers");
+    let answer: Value = serde_json::from_slice(&own.stdout).unwrap();
+    assert_eq!(answer["certificate"]["passed"], true);
+    assert_eq!(answer["command"]["inputNd"].as_array().unwrap().len(), 1);
+}
+
+#[test]
+fn step_that_makes_no_sense_exits_65_and_says_why() {
+    let mut request = first_step();
+    request["problem"]["variableHorizon"]["horizonMax"] = json!(0);
+    request["measurement"]["linear"]["components"] = json!([1.0]);
+    let refused = step_with(&request.to_string(), &[]);
+    assert_eq!(refused.status.code(), Some(65));
+    let said = text(&refused.stderr);
+    assert!(said.contains("horizon_max"), "{said}");
+    let truncated = step_with("{\"problem\": {", &[]);
+    assert_eq!(truncated.status.code(), Some(65));
+    assert!(text(&truncated.stderr).contains("line 1"));
+}
+
+#[test]
+fn simulate_prints_the_report_as_json() {
+    let arguments =
+        ["--runs", "3", "--seed", "1", "--format", "json", "--no-pictures", "--scheme", "all"];
+    let flown =
+        vbar(&["simulate", &mission("double_integrator.json")]).args(arguments).output().unwrap();
+    assert_eq!(flown.status.code(), Some(0), "{}", text(&flown.stderr));
+    let report: Value = serde_json::from_slice(&flown.stdout).unwrap();
+    assert!(report.is_object(), "{report}");
+}
+
+#[test]
+fn simulate_without_a_mission_exits_65() {
+    let ended = output(&["simulate", "nowhere.json"]);
+    assert_eq!(ended.status.code(), Some(65));
+    assert!(text(&ended.stderr).contains("nowhere.json"));
+}
+
+#[test]
+fn plan_starts_at_the_mission_or_where_it_is_told() {
+    let planned = output(&["plan", &mission("envisat.json")]);
+    assert_eq!(planned.status.code(), Some(0), "{}", text(&planned.stderr));
+    let answer: Value = serde_json::from_slice(&planned.stdout).unwrap();
+    assert!(answer["plan"]["commands"].as_array().unwrap().len() > 10);
+
+    let folder = tempfile::tempdir().unwrap();
+    let initial = folder.path().join("initial.json");
+    std::fs::write(&initial, first_step()["measurement"].to_string()).unwrap();
+    let initial = initial.to_str().unwrap();
+    let arguments = ["plan", &mission("double_integrator.json"), "--initial", initial];
+    let planned = output(&arguments);
+    assert_eq!(planned.status.code(), Some(0), "{}", text(&planned.stderr));
+}
+
+#[test]
+fn precompute_prints_the_artifact() {
+    let made = output(&["precompute", &mission("double_integrator.json")]);
+    assert_eq!(made.status.code(), Some(0), "{}", text(&made.stderr));
+    let answer: Value = serde_json::from_slice(&made.stdout).unwrap();
+    // 0.2671 is what an independent implementation found for this mission.
+    let lambda_bar = answer["artifact"]["variableHorizon"]["lambdaBar"].as_f64().unwrap();
+    assert!((lambda_bar - 0.2671).abs() < 5e-5, "{lambda_bar}");
+}
+
+/// The nominal next state of the double integrator: the first row after the present one.
+fn expected(prediction: &vbar_client::v1::Prediction) -> Measurement {
+    measured_at(prediction.states_nd.as_ref().unwrap().values[2..4].to_vec())
+}
+
+fn measured_at(components: Vec<f64>) -> Measurement {
+    let state = Some(measurement::State::Linear(LinearState { components }));
+    Measurement { state, elapsed_s: None }
+}
+
+#[tokio::test]
+async fn loop_survives_the_death_of_its_node() {
+    let problem = Mission::load(mission("double_integrator.json").as_ref()).unwrap().problem;
+    let controller = Controller::Problem(problem);
+    let (mut first, second) = (Process::start(&[]), Process::start(&[]));
+    let options = || Options { attempts_max: 2, ..Options::default() };
+    let mut flight = Client::connect(&first.url, options())
+        .await
+        .unwrap()
+        .closed_loop(controller.clone())
+        .await
+        .unwrap();
+    let mut measured = measured_at(vec![20.0, 0.0]);
+    for _ in 0..3 {
+        let answer = flight.step(measured).await.unwrap();
+        measured = expected(answer.prediction.as_ref().unwrap());
+    }
+    first.child.kill().unwrap();
+    first.child.wait().unwrap();
+    let error = flight.step(measured.clone()).await.unwrap_err();
+    assert_eq!(error.code, Code::Unavailable, "{error}");
+
+    let state = flight.controller_state().clone();
+    let client = Client::connect(&second.url, options()).await.unwrap();
+    let mut flight = client.closed_loop(controller).await.unwrap().from_state(state);
+    let answer = flight.step(measured).await.unwrap();
+    assert_eq!(answer.step_index, 3);
+    assert!(answer.certificate.unwrap().passed);
+}

@@ -1,0 +1,5 @@
+//! The whole house: its rules, real nodes, and what the README shows.
+
+mod nodes;
+mod readme;
+mod tidy;
