@@ -281,11 +281,12 @@ impl<'a> Stages<'a> {
         }
     }
 
-    /// A minimum-time estimate of the horizon: the longest of the axes' bang-bang times of a
-    /// double integrator per input, from the distance to the reference.
+    /// A first guess of the horizon: the best bang-coast-bang of a double integrator over the
+    /// longest axis of the distance d to the reference.
     ///
-    /// [Quartullo2025a, sec. IV.A] takes the guess of a paper that is not at hand; the search
-    /// needs only a guess near the first feasible horizons.
+    /// Coasting at speed v takes d / v + v and costs 2 v of input (scaled), so J is least at
+    /// v = sqrt(d / (1 + 2 gamma_v)). Without fuel weight this is the minimum time 2 sqrt(d).
+    /// [Quartullo2025a, sec. IV.A] takes the guess of a paper that is not at hand.
     pub(super) fn guess(&self) -> usize {
         let artifact = self.artifact;
         let limit = self.horizon_limit().max(1);
@@ -298,8 +299,8 @@ impl<'a> Stages<'a> {
         };
         let Some(reference) = artifact.model.reference(self.step) else { return 1 };
         let farthest = (0..3).map(|i| (self.initial[i] - reference[i]).abs()).fold(0.0, f64::max);
-        // Accelerate half the way, brake the other half: d = (T / 2)^2 in scaled units.
-        let time = 2.0 * libm::sqrt(farthest);
+        let slowness = libm::sqrt(1.0 + 2.0 * artifact.problem.weights.fuel);
+        let time = libm::sqrt(farthest) * (slowness + 1.0 / slowness);
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
         let steps = libm::ceil(time / tau).clamp(1.0, 1e6) as usize;
         steps.clamp(1, limit)

@@ -83,8 +83,10 @@ pub struct DualSimplex {
     rho: Vec<f64>,
     multiplier_step: Vec<f64>,
     entering: Vec<f64>,
-    candidates: Vec<ratio::Candidate>,
+    lengths: Vec<f64>,
+    events: Vec<ratio::Candidate>,
     passed: Vec<ratio::Candidate>,
+    right_sides: Vec<f64>,
     costates: Vec<f64>,
     stalled: usize,
     drift: f64,
@@ -142,7 +144,7 @@ enum Leaving {
 enum End {
     Optimal,
     Infeasible(Leaving),
-    CutOff,
+    CutOff(f64),
     Exhausted,
 }
 
@@ -209,9 +211,7 @@ impl Solver for DualSimplex {
                 End::Infeasible(leaving) => {
                     (Status::PrimalInfeasible, self.ray(program, leaving), f64::INFINITY)
                 }
-                End::CutOff => {
-                    (Status::CutOff, self.multipliers(program), self.lagrangian(program))
-                }
+                End::CutOff(bound) => (Status::CutOff, self.multipliers(program), bound),
                 End::Exhausted => (Status::BudgetExhausted, Vec::new(), f64::NAN),
             };
             let believed = match status {
@@ -579,55 +579,55 @@ impl DualSimplex {
         budget: Budget<'_>,
     ) -> Result<End, Interruption> {
         let mut since_refresh = 0;
-        let mut best = f64::NEG_INFINITY;
+        self.load_values(program);
+        let mut bound = self.lagrangian(program);
         loop {
             if pivots.is_multiple_of(BUDGET_PERIOD) {
                 budget.check()?;
             }
-            self.load_values(program);
-            let bound = self.lagrangian(program);
             if cut_off.is_some_and(|limit| bound >= limit) {
-                return Ok(End::CutOff);
+                return Ok(End::CutOff(bound));
             }
-            self.stalled =
-                if bound > best + 1e-12 * (1.0 + best.abs()) { 0 } else { self.stalled + 1 };
-            best = best.max(bound);
-            let Some(leaving) = self.price(program) else {
-                if since_refresh == 0 {
-                    return Ok(End::Optimal);
+            let leaving = self.price(program);
+            if let Some(leaving) = leaving {
+                if *pivots >= limit {
+                    return Ok(End::Exhausted);
                 }
-                self.refresh(program, SAME_VERTEX);
-                self.drift = (10.0 * self.drift).min(DRIFT_MAX);
-                since_refresh = 0;
-                continue;
-            };
-            if *pivots >= limit {
-                return Ok(End::Exhausted);
-            }
-            self.direction(program, leaving);
-            match self.ratio_test(program, leaving) {
-                ratio::Outcome::Step { candidate, sound } => {
-                    self.pivot(program, leaving, candidate);
-                    if !sound {
-                        since_refresh = REFRESH_PERIOD;
+                self.direction(program, leaving);
+                match self.ratio_test(program, leaving) {
+                    ratio::Outcome::Step { candidate, sound } => {
+                        self.pivot(program, leaving, candidate);
+                        let progress = candidate.gain > 1e-12 * (1.0 + bound.abs());
+                        self.stalled = if progress { 0 } else { self.stalled + 1 };
+                        bound += candidate.gain;
+                        since_refresh = if sound { since_refresh + 1 } else { REFRESH_PERIOD };
                     }
+                    ratio::Outcome::Unbounded => return Ok(End::Infeasible(leaving)),
                 }
-                ratio::Outcome::Unbounded => return Ok(End::Infeasible(leaving)),
+                *pivots += 1;
+            } else if since_refresh == 0 {
+                return Ok(End::Optimal);
             }
-            *pivots += 1;
-            since_refresh += 1;
-            if since_refresh >= REFRESH_PERIOD {
+            if leaving.is_none() || since_refresh >= REFRESH_PERIOD {
                 self.refresh(program, SAME_VERTEX);
+                if leaving.is_none() {
+                    self.drift = (10.0 * self.drift).min(DRIFT_MAX);
+                }
                 since_refresh = 0;
+                self.load_values(program);
+                bound = self.lagrangian(program);
+            } else {
+                self.load_values(program);
             }
         }
     }
 
     /// Values of the basic columns and the states they lead to.
     fn load_values(&mut self, program: &HorizonProgram<'_>) {
-        let right: Vec<f64> = self.active.iter().map(|row| row.right).collect();
+        self.right_sides.clear();
+        self.right_sides.extend(self.active.iter().map(|row| row.right));
         for (i, &column) in self.basic.iter().enumerate() {
-            self.values[column] = dot(self.kernel.row(i), &right);
+            self.values[column] = dot(self.kernel.row(i), &self.right_sides);
         }
         let (n, m) = (program.states(), program.inputs());
         self.states[..n].copy_from_slice(program.initial);
@@ -663,8 +663,12 @@ impl DualSimplex {
         total
     }
 
-    /// The violated column or row that leaves, if any: the largest violation in units of an
-    /// input, or the first of all when the dual objective has stalled.
+    /// The violated column or row that leaves, if any: the largest violation per unit dual step, or
+    /// the first of all when the dual objective has stalled.
+    ///
+    /// For a basic column the steepest-edge norm is a row of the kernel, so it is exact and free.
+    /// For a row it would cost a row of coefficients each; 1, its least value, does nearly as
+    /// well: 34 pivots against 31 with exact norms and 56 without any, at N = 26 on EnviSat.
     fn price(&self, program: &HorizonProgram<'_>) -> Option<Leaving> {
         let first_of_all = self.stalled > STALL;
         let mut best = None;
@@ -675,12 +679,17 @@ impl DualSimplex {
             let (bottom, top) = (points[segment as usize], points[segment as usize + 1]);
             let value = self.values[index];
             let excess = (bottom - value).max(value - top);
-            if excess > largest {
+            if excess <= FEASIBILITY {
+                continue;
+            }
+            let row = self.kernel.row(position);
+            let steepness = excess / dot(row, row).sqrt();
+            if steepness > largest {
                 best = Some(Leaving::Column { position, at_top: value > top, excess });
                 if first_of_all {
                     return best;
                 }
-                largest = excess;
+                largest = steepness;
             }
         }
         self.price_rows(program, first_of_all, largest).or(best)
@@ -702,20 +711,27 @@ impl DualSimplex {
         };
         let n = program.states();
         for index in self.layout.terminal..self.layout.end {
-            let id = self.row_id(program, index);
-            let e = self.scale[index]
-                * residual(program, id, &self.states, Some(self.terminal(program)));
+            let id = RowId {
+                family: RowFamily::Terminal,
+                stage: program.horizon,
+                index: index - self.layout.terminal,
+            };
+            let coefficients = Some(self.terminal(program));
+            let e = self.scale[index] * residual(program, id, &self.states, coefficients);
             offer(index, e, e.abs());
         }
-        let rows = program.stage_rows;
-        for stage in 1..=program.constrained_stages {
-            let z = &self.states[stage * n..][..n];
-            for row in 0..rows {
-                let index = (stage - 1) * rows + row;
-                let left = dot(program.stage_normal(stage, row), z);
-                let e = self.scale[index] * (left - program.stage_offset(stage, row));
-                offer(index, e, e);
-            }
+        let rows = program.constrained_stages * program.stage_rows;
+        let constrained = self.states[n..].chunks_exact(n).take(program.constrained_stages);
+        let states = constrained.flat_map(|z| std::iter::repeat_n(z, program.stage_rows));
+        let normals = program.stage_normals.chunks_exact(n);
+        let sides = program.stage_offsets.iter().zip(&self.scale[..rows]);
+        for (index, ((z, normal), (offset, scale))) in states.zip(normals).zip(sides).enumerate() {
+            let left = match (normal.as_array::<6>(), z.as_array::<6>()) {
+                (Some(normal), Some(z)) => (0..6).map(|i| normal[i] * z[i]).sum(),
+                _ => dot(normal, z),
+            };
+            let e = scale * (left - offset);
+            offer(index, e, e);
         }
         for index in self.layout.tracking..self.layout.terminal {
             let id = self.row_id(program, index);

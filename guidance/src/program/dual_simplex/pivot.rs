@@ -66,9 +66,9 @@ impl DualSimplex {
         match step.event {
             Event::Flip => self.at_upper[index - self.layout.tracking] = residual > 0.0,
             Event::Column { index: column, segment, .. } => {
-                let entering = self.enter(column, segment);
+                self.enter(column, segment);
                 let pivot = sign * self.gradient_step[column];
-                self.kernel.border(&entering, &self.rho, pivot);
+                self.kernel.border(&self.entering, &self.rho, pivot);
                 self.basic.push(column);
                 self.position[index] = u32::try_from(self.active.len()).unwrap_or(INACTIVE);
                 self.append_row(program, index, multiplier);
@@ -95,8 +95,8 @@ impl DualSimplex {
         match step.event {
             Event::NextSegment { segment } => self.place[column] = Place::Basic { segment },
             Event::Column { index, segment, .. } => {
-                let entering = self.enter(index, segment);
-                self.kernel.replace_column(position, &entering);
+                self.enter(index, segment);
+                self.kernel.replace_column(position, &self.entering);
                 self.basic[position] = index;
                 self.come_to_rest(column, point);
             }
@@ -109,19 +109,18 @@ impl DualSimplex {
         }
     }
 
-    /// Makes a resting column basic; returns its column of the kernel's new system, M^-1 m.
-    fn enter(&mut self, column: usize, segment: u8) -> Vec<f64> {
+    /// Makes a resting column basic; leaves M^-1 m in `entering`, with m its coefficients.
+    fn enter(&mut self, column: usize, segment: u8) {
         let count = self.columns.len();
         let value = self.values[column];
-        let line: Vec<f64> =
-            (0..self.active.len()).map(|i| self.coefficients[i * count + column]).collect();
-        for (row, coefficient) in self.active.iter_mut().zip(&line) {
+        self.right_sides.clear();
+        for (i, row) in self.active.iter_mut().enumerate() {
+            let coefficient = self.coefficients[i * count + column];
             row.right += coefficient * value;
+            self.right_sides.push(coefficient);
         }
         self.place[column] = Place::Basic { segment };
-        let mut entering = std::mem::take(&mut self.entering);
-        self.kernel.solve(&line, &mut entering);
-        entering
+        self.kernel.solve(&self.right_sides, &mut self.entering);
     }
 
     /// A basic column comes to rest at `point`.

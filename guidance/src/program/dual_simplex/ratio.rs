@@ -1,12 +1,15 @@
 //! The dual step: its direction, and how far it goes.
 
-use super::{DualSimplex, FEASIBILITY, HorizonProgram, Leaving, Place};
+use super::{Column, DualSimplex, FEASIBILITY, HorizonProgram, Leaving, Place};
 
 /// Entries below this share of the step's largest are rounding of zeros: no breakpoints. A ray
 /// found without them is checked with them, and so is an optimum.
 const NOISE: f64 = 1e-9;
 /// A pivot of at least this share of the step's largest entry is taken without a second thought.
 const SOUND_PIVOT: f64 = 1e-6;
+
+/// Relative difference of lengths that counts as none.
+const TIE: f64 = 1e-12;
 
 /// A point along the dual step where something changes.
 #[derive(Debug, Clone, Copy)]
@@ -15,6 +18,8 @@ pub(super) struct Candidate {
     pub(super) length: f64,
     /// Size of the pivot if the step ends here.
     pub(super) size: f64,
+    /// Rise of the dual objective on the way here.
+    pub(super) gain: f64,
     /// What changes.
     pub(super) event: Event,
 }
@@ -85,29 +90,22 @@ impl DualSimplex {
     /// Long-step ratio test: goes on past breakpoints while the dual objective rises.
     pub(super) fn ratio_test(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) -> Outcome {
         let largest = self.gradient_step.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
-        self.collect_candidates(program, leaving, NOISE * largest);
+        self.load_lengths(NOISE * largest);
+        self.load_events(program, leaving);
         let mut slope = match leaving {
             Leaving::Column { excess, .. } => excess,
             Leaving::Row { residual, .. } => residual.abs(),
         };
+        let (mut travelled, mut gain) = (0.0, 0.0);
         self.passed.clear();
         let chosen = loop {
-            let Some(candidate) = self.take_nearest() else {
+            let Some(mut candidate) = self.take_nearest() else {
                 return Outcome::Unbounded;
             };
-            let drop = match candidate.event {
-                Event::Column { index, segment, .. } => {
-                    let points = &self.columns[index].points;
-                    let width = points[segment as usize + 1] - points[segment as usize];
-                    candidate.size * width
-                }
-                Event::NextSegment { segment } => {
-                    let Leaving::Column { position, .. } = leaving else { break candidate };
-                    let points = &self.columns[self.basic[position]].points;
-                    points[segment as usize + 1] - points[segment as usize]
-                }
-                Event::Row { .. } | Event::Flip => break candidate,
-            };
+            gain += slope * (candidate.length - travelled);
+            travelled = candidate.length;
+            candidate.gain = gain;
+            let Some(drop) = self.slope_drop(leaving, candidate) else { break candidate };
             slope -= drop;
             // The slope is the violation that is left: what counts as met needs no further step,
             // least of all at the very edge of what can be reached.
@@ -130,36 +128,63 @@ impl DualSimplex {
         Outcome::Step { candidate: chosen, sound: true }
     }
 
-    fn collect_candidates(&mut self, program: &HorizonProgram<'_>, leaving: Leaving, noise: f64) {
-        self.candidates.clear();
-        for index in 0..self.columns.len() {
-            let step = self.gradient_step[index];
-            let Place::At(point) = self.place[index] else { continue };
-            if step.abs() <= noise {
-                continue;
+    /// By how much the slope drops at a candidate; `None` if nothing goes on beyond it.
+    fn slope_drop(&self, leaving: Leaving, candidate: Candidate) -> Option<f64> {
+        let width = |column: usize, segment: u8| {
+            let points = &self.columns[column].points;
+            points[segment as usize + 1] - points[segment as usize]
+        };
+        match (candidate.event, leaving) {
+            (Event::Column { index, segment, .. }, _) => {
+                Some(candidate.size * width(index, segment))
             }
-            self.candidates.extend(self.column_candidate(index, point, step));
+            (Event::NextSegment { segment }, Leaving::Column { position, .. }) => {
+                Some(width(self.basic[position], segment))
+            }
+            _ => None,
         }
+    }
+
+    /// Step lengths to the first breakpoint of each resting column; infinite if there is none.
+    fn load_lengths(&mut self, noise: f64) {
+        self.lengths.clear();
+        let columns = self.columns.iter().zip(&self.place);
+        let gradients = self.gradient.iter().zip(&self.gradient_step);
+        self.lengths.extend(columns.zip(gradients).map(|((column, place), (gradient, step))| {
+            match *place {
+                Place::At(point) if step.abs() > noise => {
+                    let target = column.next_gradient(point, *step);
+                    ((target - gradient) / step).max(0.0)
+                }
+                _ => f64::INFINITY,
+            }
+        }));
+    }
+
+    /// What can end the step besides resting columns.
+    fn load_events(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) {
+        self.events.clear();
         let row_noise =
             NOISE * self.multiplier_step.iter().fold(0.0_f64, |a, step| a.max(step.abs()));
         for (position, row) in self.active.iter().enumerate() {
             let step = self.multiplier_step[position];
+            if step.abs() <= row_noise {
+                continue;
+            }
             let (lower, upper) = self.multiplier_range(program, row.index);
             let bound = if step > 0.0 { upper } else { lower };
-            if step.abs() > row_noise && bound.is_finite() {
-                self.candidates.push(Candidate {
-                    length: ((bound - row.multiplier) / step).max(0.0),
-                    size: step.abs(),
-                    event: Event::Row { position, at_upper: step > 0.0 },
-                });
+            if bound.is_finite() {
+                let length = ((bound - row.multiplier) / step).max(0.0);
+                let event = Event::Row { position, at_upper: step > 0.0 };
+                self.events.push(Candidate { length, size: step.abs(), gain: 0.0, event });
             }
         }
         match leaving {
             Leaving::Row { index, .. } => {
                 let (lower, upper) = self.multiplier_range(program, index);
                 if lower.is_finite() && upper.is_finite() {
-                    let flip = Candidate { length: upper - lower, size: 1.0, event: Event::Flip };
-                    self.candidates.push(flip);
+                    let (length, event) = (upper - lower, Event::Flip);
+                    self.events.push(Candidate { length, size: 1.0, gain: 0.0, event });
                 }
             }
             Leaving::Column { position, at_top, .. } => {
@@ -169,50 +194,89 @@ impl DualSimplex {
                 let next = if at_top { segment.checked_add(1) } else { segment.checked_sub(1) };
                 if let Some(next) = next.filter(|&s| s < column.last()) {
                     let change = column.slopes[next as usize] - column.slopes[segment as usize];
-                    let event = Event::NextSegment { segment: next };
-                    self.candidates.push(Candidate { length: change.abs(), size: 1.0, event });
+                    let (length, event) = (change.abs(), Event::NextSegment { segment: next });
+                    self.events.push(Candidate { length, size: 1.0, gain: 0.0, event });
                 }
             }
         }
     }
 
-    /// The breakpoint that a resting column meets first, if any.
-    fn column_candidate(&self, index: usize, point: u8, step: f64) -> Option<Candidate> {
-        let column = &self.columns[index];
-        // A falling gradient pulls the column up.
-        let up = step < 0.0;
-        let segment = if up { point } else { point.checked_sub(1)? };
-        if segment >= column.last() {
-            return None;
-        }
-        let target = -column.slopes[segment as usize];
-        Some(Candidate {
-            length: ((target - self.gradient[index]) / step).max(0.0),
-            size: step.abs(),
-            event: Event::Column { index, segment, up },
-        })
-    }
-
     /// After a column has passed one breakpoint it may meet another.
     fn queue_next(&mut self, passed: Candidate) {
         let Event::Column { index, segment, up } = passed.event else { return };
+        let step = self.gradient_step[index];
         let point = if up { segment + 1 } else { segment };
-        let next = self.column_candidate(index, point, self.gradient_step[index]);
-        self.candidates.extend(next);
+        let target = self.columns[index].next_gradient(point, step);
+        self.lengths[index] = ((target - self.gradient[index]) / step).max(0.0);
     }
 
     /// The nearest candidate; among equals the one with the largest pivot.
     fn take_nearest(&mut self) -> Option<Candidate> {
-        let mut best = 0;
-        let first = self.candidates.first()?;
-        let (mut length, mut size) = (first.length, first.size);
-        for (i, candidate) in self.candidates.iter().enumerate().skip(1) {
-            let tie = (candidate.length - length).abs() <= 1e-12 * length;
-            if if tie { candidate.size > size } else { candidate.length < length } {
-                best = i;
+        let mut nearest: Option<usize> = None;
+        let (mut length, mut size) = (f64::INFINITY, 0.0);
+        let closer = |offered: f64, offered_size: f64, length: f64, size: f64| {
+            offered < length * (1.0 - TIE)
+                || (offered <= length * (1.0 + TIE) && offered_size > size)
+        };
+        for (i, &offered) in self.lengths.iter().enumerate() {
+            if offered <= length * (1.0 + TIE) && offered < f64::INFINITY {
+                let offered_size = self.gradient_step[i].abs();
+                if closer(offered, offered_size, length, size) {
+                    nearest = Some(i);
+                    (length, size) = (offered, offered_size);
+                }
+            }
+        }
+        let mut event = None;
+        for (i, candidate) in self.events.iter().enumerate() {
+            if closer(candidate.length, candidate.size, length, size) {
+                event = Some(i);
                 (length, size) = (candidate.length, candidate.size);
             }
         }
-        Some(self.candidates.swap_remove(best))
+        if let Some(i) = event {
+            return Some(self.events.swap_remove(i));
+        }
+        let index = nearest?;
+        self.lengths[index] = f64::INFINITY;
+        let up = self.gradient_step[index] < 0.0;
+        let segment = self.segment_ahead(index, up);
+        let event = Event::Column { index, segment, up };
+        Some(Candidate { length, size, gain: 0.0, event })
+    }
+
+    /// The segment that a resting column meets first, counting what it has passed in this step.
+    fn segment_ahead(&self, index: usize, up: bool) -> u8 {
+        let passed = self.passed.iter().rev().find_map(|candidate| match candidate.event {
+            Event::Column { index: other, segment, .. } if other == index => Some(segment),
+            _ => None,
+        });
+        let point = match (passed, self.place[index]) {
+            (Some(segment), _) => {
+                if up {
+                    segment + 1
+                } else {
+                    segment
+                }
+            }
+            (None, Place::At(point)) => point,
+            (None, Place::Basic { segment }) => segment,
+        };
+        if up { point } else { point.saturating_sub(1) }
+    }
+}
+
+impl Column {
+    /// The gradient at which the column leaves breakpoint `point` when the gradient moves in the
+    /// direction of `step`; infinite if it never does.
+    fn next_gradient(&self, point: u8, step: f64) -> f64 {
+        // A falling gradient pulls the column up.
+        if step < 0.0 {
+            if point < self.last() { -self.slopes[point as usize] } else { f64::NEG_INFINITY }
+        } else if point > 0 {
+            -self.slopes[point as usize - 1]
+        } else {
+            f64::INFINITY
+        }
     }
 }
