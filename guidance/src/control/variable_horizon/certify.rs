@@ -249,14 +249,15 @@ fn proof_rows(search: &Search<'_, '_>, proved: &InfeasibleHorizon) -> Vec<ProofR
     rows
 }
 
-/// Least relaxation of each family over a few horizons, the longest among them, to three digits.
+/// Least relaxation of each family over three horizons, the longest among them, to five
+/// percent.
 ///
 /// Bisection on the fast solver's verdict: a hundred warm feasibility programs cost less than one
 /// program of a general solver with the relaxation as a variable, which the tests compare with.
 fn relaxations(search: &mut Search<'_, '_>, limit: usize) -> Vec<Relaxation> {
     let mut horizons = vec![limit];
-    while let Some(&last) = horizons.last().filter(|&&last| last > 1 && horizons.len() < 7) {
-        horizons.push((last * 2 / 3).max(1));
+    while let Some(&last) = horizons.last().filter(|&&last| last > 1 && horizons.len() < 3) {
+        horizons.push((last / 2).max(1));
     }
     let families = [ConstraintFamily::State, ConstraintFamily::Input, ConstraintFamily::Terminal];
     let mut found: Vec<Relaxation> = Vec::new();
@@ -286,7 +287,7 @@ fn relaxation(
     /// Relaxations that are looked at, scaled units: from nothing to anything.
     const SMALLEST: f64 = 1e-9;
     const LARGEST: f64 = 1e3;
-    const RATIO: f64 = 1.001;
+    const RATIO: f64 = 1.05;
     let mut simplex = DualSimplex::default();
     let mut basis = None;
     let mut suffices = |amount: f64| -> Option<bool> {
@@ -409,7 +410,10 @@ mod tests {
             let general = least_relaxation(&program, relaxed);
             match (fast, general) {
                 (Some(fast), Some(general)) => {
-                    assert!((fast / general - 1.0).abs() < 2e-3, "{family:?} {fast} {general}");
+                    assert!(
+                        fast / general < 1.051 && fast / general > 0.999,
+                        "{family:?} {fast} {general}"
+                    );
                 }
                 (None, None) => {}
                 other => panic!("{family:?}: {other:?}"),

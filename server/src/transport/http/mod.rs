@@ -255,10 +255,11 @@ impl Http {
             None => None,
             Some(value) => {
                 let text = value.to_str().ok().filter(|text| text.len() <= 9);
-                let expected = "a whole number of milliseconds, up to 9 digits";
+                let expected = "a whole number of milliseconds above 0, up to 9 digits";
                 let milliseconds = text
                     .filter(|text| text.bytes().all(|c| c.is_ascii_digit()))
                     .and_then(|text| text.parse().ok())
+                    .filter(|&milliseconds| milliseconds > 0)
                     .ok_or_else(|| deadline_fault(TIMEOUT, expected, value))?;
                 Some(Duration::from_millis(milliseconds))
             }
