@@ -134,6 +134,8 @@ pub struct Summary {
     pub worst_margin_m: Option<f64>,
     /// Least margin to the input constraints, normalised; 0 is a command at its bound.
     pub worst_input_margin: Option<f64>,
+    /// The plant is measured in metres.
+    pub in_metres: bool,
     /// Metrics by their name in the report.
     pub metrics: Vec<(&'static str, Statistics)>,
     /// Share of steps whose command came from the grown terminal set; only the adaptive scheme
@@ -182,6 +184,7 @@ impl Summary {
                 .filter_map(Flight::worst_input_margin_nd)
                 .reduce(f64::min),
             worst_margin_m: flights.iter().filter_map(in_metres).reduce(f64::min),
+            in_metres: flights.iter().any(|flight| flight.position_unit_m().is_some()),
             metrics: metrics(campaign),
             fallback_share: adaptive.then(|| fallback as f64 / count as f64),
             steps: count,
@@ -208,6 +211,14 @@ impl Summary {
         put("redraws", self.redraws.into());
         put("arrived", self.arrived.into());
         put("infeasible", self.infeasible.into());
+        // Means over the runs that arrived: null, not absent, where none did.
+        let metres = self.in_metres;
+        let distance = if metres { "final_distance_m" } else { "final_norm" };
+        for name in [distance, "fuel", "delta_v_m_s", "completion_steps"] {
+            if metres || name != "delta_v_m_s" {
+                put(name, Value::Null);
+            }
+        }
         for (name, statistics) in &self.metrics {
             put(name, statistics.json());
         }

@@ -144,20 +144,30 @@ impl<'a, 'b> Search<'a, 'b> {
         Ok(None)
     }
 
-    /// Second step: downhill until the cost no longer decreases.
+    /// Second step: downhill until the cost no longer decreases, looking past a hump of one
+    /// horizon: in the Monte Carlo study one step in a thousand lies behind such a hump.
     fn descend(&mut self, goal: &Goal, start: Found, limit: usize) -> Result<Found, Failure> {
+        const HUMP: usize = 1;
         let mut best = start;
         for forward in [false, true] {
             let start = best.horizon;
-            loop {
-                let next = if forward { best.horizon + 1 } else { best.horizon - 1 };
-                if next < 1 || next > limit || self.was_tried(next) || self.is_hopeless(next, &best)
-                {
+            let mut worse = 0;
+            let mut next = start;
+            while worse <= HUMP {
+                let ahead = if forward { next.checked_add(1) } else { next.checked_sub(1) };
+                let Some(horizon) = ahead.filter(|&n| n >= 1 && n <= limit) else { break };
+                next = horizon;
+                if self.is_hopeless(next, &best) {
                     break;
                 }
-                match self.attempt(goal, next, Some(best.cost))? {
-                    Tried::Solved(found) if found.cost < best.cost => best = *found,
-                    _ => break,
+                if !self.was_tried(next)
+                    && let Tried::Solved(found) = self.attempt(goal, next, Some(best.cost))?
+                    && found.cost < best.cost
+                {
+                    best = *found;
+                    worse = 0;
+                } else {
+                    worse += 1;
                 }
             }
             if best.horizon != start {
