@@ -201,13 +201,15 @@ fn long_computation() -> Value {
 #[tokio::test(flavor = "multi_thread")]
 async fn step_deadline_already_over_is_said() {
     let server = server().await;
+    // Over HTTP a deadline of nothing is a fault of the request, named like any other.
     let headers = [("content-type", "application/json"), ("request-timeout-ms", "0")];
     let body = long_computation().to_string();
     let answer = server.http(::http::Method::POST, "/v1/step", &headers, body.into()).await;
-    assert_eq!(answer.status, 504, "{}", answer.text());
+    assert_eq!(answer.status, 400, "{}", answer.text());
     let error = answer.json();
-    assert_eq!(error["code"], 4);
-    assert_eq!(detail(&error, "ErrorInfo").unwrap()["reason"], "DEADLINE_EXCEEDED");
+    assert_eq!(error["code"], 3);
+    let violations = detail(&error, "BadRequest").unwrap();
+    assert_eq!(violations["fieldViolations"][0]["field"], "request-timeout-ms");
     let mut request = tonic::Request::new(missions::message::<v1::StepRequest>(long_computation()));
     request.metadata_mut().insert("grpc-timeout", "0n".parse().unwrap());
     let status = server.grpc().await.step(request).await.unwrap_err();
