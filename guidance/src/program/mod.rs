@@ -13,7 +13,9 @@ pub use dual_simplex::DualSimplex;
 pub use gauge::zonotope_gauge;
 pub use projection::project_onto_polytope;
 pub use tables::PlantTables;
-pub use verify::{DualBound, Residual, Residuals, dual_bound, farkas_margin, simulate, verify};
+pub use verify::{
+    DualBound, Residual, Residuals, dual_bound, farkas_margin, simulate, verify, verify_trajectory,
+};
 
 use crate::budget::{Budget, Interruption};
 

@@ -64,6 +64,11 @@ impl PlantTables {
         self.responses.len() / (self.n * self.m)
     }
 
+    /// A (n x n) and B (n x m), each column by column: for whoever recomputes without the tables.
+    pub(crate) fn matrices(&self) -> (&[f64], &[f64]) {
+        (&self.a_columns, &self.b_columns)
+    }
+
     /// Row r of A^i B.
     pub(crate) fn response_row(&self, i: usize, r: usize) -> &[f64] {
         &self.responses[(i * self.n + r) * self.m..][..self.m]

@@ -1,7 +1,7 @@
 //! What an answer is worth, recomputed from the program alone.
 //!
-//! Plain recursions over `nalgebra`-free slices in the order of the definitions; nothing here is
-//! shared with a solver's own bookkeeping.
+//! Plain recursions over `nalgebra`-free slices in the order of the definitions, from A and B and
+//! not from the tables that the solvers run on; nothing here is shared with a solver.
 
 use super::{HorizonProgram, Multiplier, RowFamily, RowId};
 
@@ -9,8 +9,6 @@ use super::{HorizonProgram, Multiplier, RowFamily, RowId};
 /// negative is the margin left.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Residuals {
-    /// z_0 .. z_N, (N + 1) n values.
-    pub states: Vec<f64>,
     /// The objective of the inputs.
     pub objective: f64,
     /// Worst bound of an input.
@@ -48,22 +46,41 @@ pub struct DualBound {
 /// z_0 .. z_N under `inputs`, by z_{j+1} = A z_j + B v_j.
 #[must_use]
 pub fn simulate(program: &HorizonProgram<'_>, inputs: &[f64]) -> Vec<f64> {
-    let n = program.states();
+    let (n, m) = (program.states(), program.inputs());
+    let (a, b) = program.plant.matrices();
     let mut states = vec![0.0; (program.horizon + 1) * n];
     states[..n].copy_from_slice(program.initial);
-    program.plant.roll_forward(inputs, &mut states);
+    for (j, v) in inputs.chunks_exact(m).enumerate() {
+        let (past, future) = states.split_at_mut((j + 1) * n);
+        let (z, next) = (&past[j * n..], &mut future[..n]);
+        for (column, weight) in a.chunks_exact(n).chain(b.chunks_exact(n)).zip(z.iter().chain(v)) {
+            next.iter_mut().zip(column).for_each(|(next, entry)| *next += entry * weight);
+        }
+    }
     states
 }
 
-/// Residuals of `inputs` (N m values) and `terminal_coefficients` (p values).
+/// Residuals of `inputs` (N m values) and `terminal_coefficients` (p values), along the states
+/// that they lead to.
 #[must_use]
 pub fn verify(
     program: &HorizonProgram<'_>,
     inputs: &[f64],
     terminal_coefficients: &[f64],
 ) -> Residuals {
+    verify_trajectory(program, &simulate(program, inputs), inputs, terminal_coefficients)
+}
+
+/// Residuals of a trajectory whose `states` ((N + 1) n values) are taken as they are given;
+/// whether they follow the dynamics is for the caller to check.
+#[must_use]
+pub fn verify_trajectory(
+    program: &HorizonProgram<'_>,
+    states: &[f64],
+    inputs: &[f64],
+    terminal_coefficients: &[f64],
+) -> Residuals {
     let (n, m, horizon) = (program.states(), program.inputs(), program.horizon);
-    let states = simulate(program, inputs);
     let mut input_bound = None;
     for (i, v) in inputs.iter().enumerate() {
         let value = (v - program.input_upper[i]).max(program.input_lower[i] - v);
@@ -96,10 +113,8 @@ pub fn verify(
         keep_worst(&mut terminal, Residual { stage: horizon, index, value: miss.abs() });
     }
     let largest = terminal_coefficients.iter().map(|xi| xi.abs() - 1.0).reduce(f64::max);
-    let objective = objective(program, inputs, &states);
     Residuals {
-        states,
-        objective,
+        objective: objective(program, inputs, states),
         input_bound,
         input_row,
         stage_row,
@@ -121,9 +136,13 @@ fn objective(program: &HorizonProgram<'_>, inputs: &[f64], states: &[f64]) -> f6
 }
 
 /// The lower bound that `multipliers` prove: the minimum of the Lagrangian over the input bounds.
-/// Any multipliers give a valid bound; wrong signs are taken as 0.
+/// Any multipliers of the program's rows give a valid bound; wrong signs are taken as 0.
+/// Multipliers of rows that the program has not prove nothing.
 #[must_use]
 pub fn dual_bound(program: &HorizonProgram<'_>, multipliers: &[Multiplier]) -> DualBound {
+    if !multipliers.iter().all(|multiplier| has_row(program, multiplier.row)) {
+        return DualBound { value: f64::NEG_INFINITY, clamped: 0.0 };
+    }
     let mut clamped = 0.0_f64;
     let weight = program.tracking_weight;
     let legal: Vec<Multiplier> = multipliers
@@ -140,6 +159,18 @@ pub fn dual_bound(program: &HorizonProgram<'_>, multipliers: &[Multiplier]) -> D
         .collect();
     let value = program.constant + minimum_of_lagrangian(program, &legal, program.input_cost).0;
     DualBound { value: if value.is_nan() { f64::NEG_INFINITY } else { value }, clamped }
+}
+
+fn has_row(program: &HorizonProgram<'_>, RowId { family, stage, index }: RowId) -> bool {
+    let n = program.states();
+    match family {
+        RowFamily::Stage => {
+            (1..=program.constrained_stages).contains(&stage) && index < program.stage_rows
+        }
+        RowFamily::Tracking => (1..=program.tracked_stages).contains(&stage) && index < n,
+        RowFamily::Input => stage < program.horizon && index < program.input_rows(),
+        RowFamily::Terminal => stage == program.horizon && index < n,
+    }
 }
 
 /// How strongly a ray proves that no inputs satisfy the rows: positive is a proof. Relative to
@@ -167,6 +198,7 @@ fn minimum_of_lagrangian(
     cost: f64,
 ) -> (f64, f64) {
     let (n, m, horizon) = (program.states(), program.inputs(), program.horizon);
+    let (a, b) = program.plant.matrices();
     let mut costates = vec![0.0; (horizon + 1) * n];
     let mut gradient = vec![0.0; horizon * m];
     let mut terminal = vec![0.0; n];
@@ -207,11 +239,11 @@ fn minimum_of_lagrangian(
     for stage in (1..=horizon).rev() {
         let costate = &mut costates[stage * n..][..n];
         costate.iter_mut().zip(&carried).for_each(|(l, c)| *l += c);
-        let mut slope = vec![0.0; m];
-        program.plant.input_gradient(costate, &mut slope);
+        // B' costate and A' costate.
         let entries = gradient[(stage - 1) * m..][..m].iter_mut();
-        entries.zip(&slope).for_each(|(d, s)| *d += s);
-        program.plant.costate_back(costate, &mut carried);
+        entries.zip(b.chunks_exact(n)).for_each(|(d, column)| *d += sum_product(column, costate));
+        let entries = carried.iter_mut().zip(a.chunks_exact(n));
+        entries.for_each(|(c, column)| *c = sum_product(column, costate));
     }
     for (l, x) in carried.iter().zip(program.initial) {
         add(l * x);

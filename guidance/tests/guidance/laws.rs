@@ -1,7 +1,7 @@
 //! Laws of the closed loop on random missions, and what a certificate refuses.
 
 use nalgebra::{DMatrix, DVector, Vector3};
-use proptest::prelude::*;
+use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use vbar_guidance::{
@@ -11,7 +11,7 @@ use vbar_guidance::{
         variable_horizon::{
             Artifact, Branch, GainChoice, HillPlant, HorizonSearch, MeasuredState, Measurement,
             PlanOutcome, Plant, Problem, Scheme, State, Step, TerminalFallback, TerminalPoint,
-            VariableHorizon, Verdict, Weights, plan,
+            Trajectory, VariableHorizon, Verdict, Weights, plan, verify_step,
         },
     },
     dynamics::HillScaling,
@@ -164,6 +164,95 @@ fn step(mission: &Mission, artifact: &Artifact, state: &State, x: &DVector<f64>)
         .unwrap_or_else(|error| panic!("{mission:?}: {error:?}"))
 }
 
+/// The state after one step under `input` and a drawn disturbance.
+fn flown(
+    artifact: &Artifact,
+    x: &DVector<f64>,
+    input: &DVector<f64>,
+    law: DisturbanceLaw,
+    random: &mut ChaCha8Rng,
+) -> DVector<f64> {
+    let summary = artifact.summary();
+    let w = draw(&summary.disturbance_generators, law, random);
+    &summary.a * x + &summary.b * input + w
+}
+
+/// Verifies an answer as it is, then altered in one place at a time. The tolerances are 1e-9 on
+/// scaled constraints and 1e-7 (1 + J) on the cost; an input of 1e-6 moves a state by 1.2e-8.
+fn check_verification(
+    mission: &Mission,
+    artifact: &Artifact,
+    before: &State,
+    x: &DVector<f64>,
+    answer: &Step,
+    at: prop::sample::Index,
+) {
+    let verified = |answer: &Step| {
+        let measured = mission.measured(x);
+        verify_step(artifact, before, &measured, answer).unwrap().expect("it gives a command")
+    };
+    assert_eq!(Some(verified(answer)), answer.certificate, "{mission:?}");
+    assert!(verified(answer).passed, "{mission:?}");
+    let refused = |what: &str, alter: &dyn Fn(&mut Step, &mut Trajectory)| {
+        let mut altered = answer.clone();
+        let mut trajectory = altered.trajectory.take().unwrap();
+        alter(&mut altered, &mut trajectory);
+        altered.trajectory = Some(trajectory);
+        let certificate = verified(&altered);
+        assert!(!certificate.passed, "{what}: {certificate:?} {mission:?}");
+    };
+    let horizon = answer.diagnostics.horizon;
+    let (stage, axis) = (at.index(horizon), at.index(3));
+    refused("input", &|_, t| t.inputs[(stage, axis)] += 1e-6);
+    refused("first state", &|_, t| t.states[(0, axis)] += 1e-8);
+    refused("later state", &|_, t| t.states[(stage + 1, axis + 3)] += 1e-8);
+    refused("no number", &|_, t| t.states[(stage, axis)] = f64::NAN);
+    refused("input, flown to its end", &|_, t| {
+        t.inputs[(stage, axis)] += 1e-4;
+        let summary = artifact.summary();
+        for j in 0..horizon {
+            let (z, v) = (t.states.row(j).transpose(), t.inputs.row(j).transpose());
+            t.states.set_row(j + 1, &(&summary.a * z + &summary.b * v).transpose());
+        }
+    });
+    let cost = answer.diagnostics.cost;
+    refused("cost", &|a, _| a.diagnostics.cost += 1e-5 * (1.0 + cost));
+    refused("horizon", &|a, _| a.diagnostics.horizon += 1);
+    refused("shorter trajectory", &|a, t| {
+        a.diagnostics.horizon -= 1;
+        *t = Trajectory {
+            states: t.states.rows(0, horizon).into_owned(),
+            inputs: t.inputs.rows(0, horizon - 1).into_owned(),
+        };
+    });
+    refused("terminal centre", &|a, _| a.diagnostics.terminal_centre[axis] += 1e-7);
+    refused("terminal set", &|a, _| a.diagnostics.terminal_set_powers.push(1));
+    refused("command", &|a, _| {
+        let Verdict::Command(command) = &mut a.verdict else { unreachable!("checked above") };
+        command.input[axis] += 1e-9;
+    });
+    refused("no evidence", &|a, _| a.evidence = None);
+    refused("step", &|a, _| a.index += 1);
+    let evidence = answer.evidence.as_ref().unwrap();
+    let optimal = !matches!(
+        answer.certificate.as_ref().unwrap().claim,
+        Claim::Feasible | Claim::PreviousPlanTail
+    );
+    // Without multipliers the bound is N itself.
+    if optimal && !evidence.multipliers.is_empty() && cost > answer_bound(answer) {
+        refused("multipliers", &|a, _| a.evidence.as_mut().unwrap().multipliers.clear());
+        refused("row beyond the program", &|a, _| {
+            a.evidence.as_mut().unwrap().multipliers[0].row.stage = 1_000_000;
+        });
+    }
+}
+
+/// N, and the gap that passes.
+fn answer_bound(answer: &Step) -> f64 {
+    let horizon = u32::try_from(answer.diagnostics.horizon).unwrap();
+    f64::from(horizon) + 1e-6 * (1.0 + answer.diagnostics.cost)
+}
+
 /// Flies a mission and checks, at every step, what the papers promise.
 fn fly(mission: &Mission) -> Result<bool, TestCaseError> {
     let artifact = Artifact::prepare(&mission.problem()).unwrap();
@@ -217,6 +306,22 @@ proptest! {
     #[test]
     fn closed_loop_keeps_the_papers_promises(mission in missions()) {
         fly(&mission)?;
+    }
+
+    /// The certificate can be made again from the answer alone, and no altered answer passes.
+    #[test]
+    fn certificate_refuses_a_tampered_answer(mission in missions(), at: prop::sample::Index) {
+        let artifact = Artifact::prepare(&mission.problem()).unwrap();
+        let mut random = ChaCha8Rng::seed_from_u64(mission.seed);
+        let (mut x, mut state) = (mission.start(), VariableHorizon::start(&artifact));
+        for _ in 0..6 {
+            let answer = step(&mission, &artifact, &state, &x);
+            let Verdict::Command(command) = &answer.verdict else { break };
+            let input = command.input.clone();
+            check_verification(&mission, &artifact, &state, &x, &answer, at);
+            x = flown(&artifact, &x, &input, mission.law, &mut random);
+            state = answer.next;
+        }
     }
 
     /// The fast path against Clarabel on programs nobody chose.
@@ -357,6 +462,48 @@ fn deadline_is_answered_with_what_is_certified() {
         state = answer.next;
     }
     panic!("no arrival");
+}
+
+#[test]
+fn certificate_is_made_again_for_every_branch() {
+    let mut seen = Vec::new();
+    let at = prop::sample::Index::arbitrary_with(()).new_tree(&mut TestRunner::deterministic());
+    let at = at.unwrap().current();
+    for scheme in [Scheme::AdaptiveTerminal, Scheme::FixedTerminal, Scheme::TubeOptimalControl] {
+        for reference_fallback in [false, true] {
+            let law = DisturbanceLaw::ConstantVertex;
+            let mission = Mission { reference_fallback, ..example(scheme, law) };
+            let artifact = Artifact::prepare(&mission.problem()).unwrap();
+            let mut random = ChaCha8Rng::seed_from_u64(3);
+            let (mut x, mut state) = (mission.start(), VariableHorizon::start(&artifact));
+            for k in 0..300 {
+                // Every third step without time to optimise.
+                let questions = if k % 3 == 2 { 0 } else { usize::MAX };
+                let kind = Interruption::Deadline;
+                let answer =
+                    interrupted_step(&mission, &artifact, &state, &x, questions, kind).unwrap();
+                let Verdict::Command(command) = &answer.verdict else { break };
+                let input = command.input.clone();
+                check_verification(&mission, &artifact, &state, &x, &answer, at);
+                let branch = answer.diagnostics.branch;
+                if !seen.contains(&(scheme, branch)) {
+                    seen.push((scheme, branch));
+                }
+                x = flown(&artifact, &x, &input, law, &mut random);
+                state = answer.next;
+            }
+        }
+    }
+    for (scheme, branch) in [
+        (Scheme::AdaptiveTerminal, Branch::TerminalPoint),
+        (Scheme::AdaptiveTerminal, Branch::TerminalSet),
+        (Scheme::AdaptiveTerminal, Branch::PreviousPlanTail),
+        (Scheme::FixedTerminal, Branch::TerminalSet),
+        (Scheme::FixedTerminal, Branch::PreviousPlanTail),
+        (Scheme::TubeOptimalControl, Branch::TubeFeedback),
+    ] {
+        assert!(seen.contains(&(scheme, branch)), "{scheme:?} never took {branch:?}: {seen:?}");
+    }
 }
 
 #[test]

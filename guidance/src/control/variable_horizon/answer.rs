@@ -6,6 +6,7 @@ use super::State;
 use crate::{
     control::{Certificate, Infeasibility},
     frames::RelativeState,
+    program::Multiplier,
     units::{Acceleration, Force, Seconds},
 };
 
@@ -40,6 +41,8 @@ pub struct Step {
     pub trajectory: Option<Trajectory>,
     /// The proof; `None` without a command.
     pub certificate: Option<Certificate>,
+    /// What the proof needs besides the trajectory; `None` without a command.
+    pub evidence: Option<Evidence>,
     /// What acted since the previous step; `None` at step 0.
     pub disturbance: Option<RealisedDisturbance>,
     /// How it came about.
@@ -102,6 +105,17 @@ impl Trajectory {
     pub fn horizon(&self) -> usize {
         self.inputs.nrows()
     }
+}
+
+/// What a certificate needs besides the trajectory, so that whoever holds an answer can make it
+/// again without a solver.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Evidence {
+    /// xi with z_N = centre + generators xi; empty for a terminal point.
+    pub terminal_coefficients: Vec<f64>,
+    /// Multipliers that prove the lower bound on the cost; empty if none is claimed or if it was
+    /// proved at step 0.
+    pub multipliers: Vec<Multiplier>,
 }
 
 /// The disturbance since the previous step.

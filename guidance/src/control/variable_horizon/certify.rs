@@ -1,20 +1,20 @@
 //! Certificates and named infeasibility, from the program and the answer alone.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 
 use super::{
-    Trajectory,
+    Evidence, Trajectory,
     search::{Found, InfeasibleHorizon, Proof, Search},
-    stages::as_f64,
+    stages::{Stages, as_f64},
 };
 use crate::{
     budget::Budget,
     control::{
         Certificate, Claim, ConstraintFamily, ConstraintMargin, Infeasibility, ProofRow, Relaxation,
     },
-    matrices::times_vector,
     program::{
-        DualSimplex, HorizonProgram, Residual, RowFamily, Solver, Status, dual_bound, verify,
+        DualSimplex, HorizonProgram, Residual, Residuals, RowFamily, Solver, Status, dual_bound,
+        simulate, verify_trajectory,
     },
 };
 
@@ -29,18 +29,13 @@ const QUOTED_ROWS: usize = 8;
 /// A verified answer.
 pub(super) struct Verified {
     pub(super) trajectory: Trajectory,
+    pub(super) evidence: Evidence,
     pub(super) certificate: Certificate,
 }
 
 /// Verifies what a search found.
 pub(super) fn verify_found(search: &Search<'_, '_>, found: &Found) -> Verified {
     let program = search.stages.program(found.horizon, &found.terminal);
-    let minimum_time = search.stages.artifact.is_minimum_time();
-    let bound = if minimum_time {
-        as_f64(found.horizon)
-    } else {
-        dual_bound(&program, &found.solution.multipliers).value
-    };
     let claim = match found.proof {
         Proof::Global => Claim::Global,
         Proof::ToHorizonMax => Claim::GlobalToHorizonMax,
@@ -48,32 +43,132 @@ pub(super) fn verify_found(search: &Search<'_, '_>, found: &Found) -> Verified {
         Proof::Fixed => Claim::FixedHorizon,
         Proof::None => Claim::Feasible,
     };
-    let inputs = &found.solution.inputs;
-    let coefficients = &found.solution.terminal_coefficients;
-    let mut verified = verify_inputs(search, &program, inputs, coefficients, claim, Some(bound));
-    if minimum_time {
-        verified.certificate.cost = as_f64(found.horizon);
-        verified.certificate.passed &= verified.certificate.relative_gap() == Some(0.0);
-    }
-    verified
+    let evidence = Evidence {
+        terminal_coefficients: found.solution.terminal_coefficients.clone(),
+        multipliers: found.solution.multipliers.clone(),
+    };
+    let lower_bound = Some(lower_bound(&search.stages, &program, &evidence));
+    let statement = Statement { claim, cost: Some(found.cost), lower_bound };
+    verify_inputs(&search.stages, &program, &found.solution.inputs, evidence, statement)
 }
 
-/// Verifies inputs against a program; a claim of optimality needs a bound.
+/// What the multipliers prove of J at this horizon; N itself for minimum time.
+pub(super) fn lower_bound(
+    stages: &Stages<'_>,
+    program: &HorizonProgram<'_>,
+    evidence: &Evidence,
+) -> f64 {
+    if stages.artifact.is_minimum_time() {
+        as_f64(program.horizon)
+    } else {
+        dual_bound(program, &evidence.multipliers).value
+    }
+}
+
+/// Verifies the trajectory that inputs lead to.
 pub(super) fn verify_inputs(
-    search: &Search<'_, '_>,
+    stages: &Stages<'_>,
     program: &HorizonProgram<'_>,
     inputs: &[f64],
-    coefficients: &[f64],
-    claim: Claim,
-    lower_bound: Option<f64>,
+    evidence: Evidence,
+    statement: Statement,
 ) -> Verified {
-    let residuals = verify(program, inputs, coefficients);
     let (n, m) = (program.states(), program.inputs());
     let trajectory = Trajectory {
-        states: DMatrix::from_row_slice(program.horizon + 1, n, &residuals.states),
+        states: DMatrix::from_row_slice(program.horizon + 1, n, &simulate(program, inputs)),
         inputs: DMatrix::from_row_slice(program.horizon, m, inputs),
     };
-    let dynamics_residual = dynamics_residual(search, &trajectory);
+    let certificate = certificate(stages, program, &trajectory, &evidence, statement);
+    Verified { trajectory, evidence, certificate }
+}
+
+/// What is said of a trajectory.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Statement {
+    pub(super) claim: Claim,
+    /// The stated J; `None` where nothing was stated before.
+    pub(super) cost: Option<f64>,
+    /// Proved lower bound on J; a claim of optimality needs one.
+    pub(super) lower_bound: Option<f64>,
+}
+
+/// The certificate of a trajectory that nobody vouches for: every state is taken as it stands
+/// and compared with what the plant makes of its predecessor.
+///
+/// The one place where certificates are made; [`super::verify_step`] comes here too.
+pub(super) fn certificate(
+    stages: &Stages<'_>,
+    program: &HorizonProgram<'_>,
+    trajectory: &Trajectory,
+    evidence: &Evidence,
+    statement: Statement,
+) -> Certificate {
+    let Statement { claim, cost: stated_cost, lower_bound } = statement;
+    if !is_of_shape(trajectory, program) {
+        return refused(claim);
+    }
+    let states = row_by_row(&trajectory.states);
+    let inputs = row_by_row(&trajectory.inputs);
+    let residuals = verify_trajectory(program, &states, &inputs, &evidence.terminal_coefficients);
+    let margins = margins(&residuals);
+    let dynamics_residual = dynamics_residual(stages, program.initial, &states, &inputs);
+    let minimum_time = stages.artifact.is_minimum_time();
+    let cost = if minimum_time { as_f64(program.horizon) } else { residuals.objective };
+    let generators = program.terminal_generator_count();
+    let in_set = evidence.terminal_coefficients.len() == generators
+        && residuals.terminal_coefficient.is_none_or(|excess| excess <= TOLERANCE);
+    let mut certificate = Certificate {
+        passed: false,
+        claim,
+        tolerance: TOLERANCE,
+        dynamics_residual,
+        margins,
+        cost,
+        lower_bound,
+    };
+    let near = |gap: f64| gap.abs() <= GAP_TOLERANCE;
+    let cost_holds = stated_cost.is_none_or(|stated| near((stated - cost) / (1.0 + cost.abs())));
+    let claims_optimum = !matches!(claim, Claim::Feasible | Claim::PreviousPlanTail);
+    let gap_closed = !claims_optimum || certificate.relative_gap().is_some_and(near);
+    certificate.passed = in_set
+        && cost_holds
+        && gap_closed
+        && dynamics_residual <= TOLERANCE
+        && certificate.margins.iter().all(|margin| margin.margin >= -TOLERANCE);
+    certificate
+}
+
+/// The certificate of what is not even a trajectory of its problem.
+pub(super) fn refused(claim: Claim) -> Certificate {
+    Certificate {
+        passed: false,
+        claim,
+        tolerance: TOLERANCE,
+        dynamics_residual: f64::INFINITY,
+        margins: Vec::new(),
+        cost: f64::INFINITY,
+        lower_bound: None,
+    }
+}
+
+fn is_of_shape(trajectory: &Trajectory, program: &HorizonProgram<'_>) -> bool {
+    trajectory.states.shape() == (program.horizon + 1, program.states())
+        && trajectory.inputs.shape() == (program.horizon, program.inputs())
+        && is_finite(trajectory)
+}
+
+/// Comparisons and maxima overlook what is not a number.
+pub(super) fn is_finite(trajectory: &Trajectory) -> bool {
+    trajectory.states.iter().chain(trajectory.inputs.iter()).all(|x| x.is_finite())
+}
+
+pub(super) fn row_by_row(matrix: &DMatrix<f64>) -> Vec<f64> {
+    let columns = matrix.ncols();
+    (0..matrix.len()).map(|i| matrix[(i / columns, i % columns)]).collect()
+}
+
+/// The tightest row of each family that there is.
+fn margins(residuals: &Residuals) -> Vec<ConstraintMargin> {
     let tightest_input = [residuals.input_bound, residuals.input_row]
         .into_iter()
         .flatten()
@@ -83,46 +178,34 @@ pub(super) fn verify_inputs(
         (ConstraintFamily::Input, tightest_input),
         (ConstraintFamily::Terminal, Some(residuals.terminal)),
     ];
-    let margins: Vec<ConstraintMargin> = families
+    families
         .into_iter()
         .filter_map(|(family, residual)| residual.map(|r| margin(family, r)))
-        .collect();
-    let minimum_time = search.stages.artifact.is_minimum_time();
-    let outside_set = residuals.terminal_coefficient.is_some_and(|excess| excess > TOLERANCE);
-    let mut certificate = Certificate {
-        passed: !outside_set
-            && dynamics_residual <= TOLERANCE
-            && margins.iter().all(|margin| margin.margin >= -TOLERANCE),
-        claim,
-        tolerance: TOLERANCE,
-        dynamics_residual,
-        margins,
-        cost: residuals.objective,
-        lower_bound,
-    };
-    let claims_optimum = !matches!(claim, Claim::Feasible | Claim::PreviousPlanTail);
-    if claims_optimum && !minimum_time {
-        let gap = certificate.relative_gap();
-        certificate.passed &= gap.is_some_and(|gap| gap.abs() <= GAP_TOLERANCE);
-    }
-    Verified { trajectory, certificate }
+        .collect()
 }
 
 fn margin(family: ConstraintFamily, residual: Residual) -> ConstraintMargin {
     ConstraintMargin { family, stage: residual.stage, row: residual.index, margin: -residual.value }
 }
 
-/// max |z_{j+1} - A z_j - B v_j|, with the artifact's matrices and not the solver's tables.
-fn dynamics_residual(search: &Search<'_, '_>, trajectory: &Trajectory) -> f64 {
-    let model = &search.stages.artifact.model;
-    let row = |matrix: &DMatrix<f64>, i: usize| -> DVector<f64> { matrix.row(i).transpose() };
-    (0..trajectory.horizon())
-        .map(|j| {
-            let next = times_vector(&model.a, &row(&trajectory.states, j))
-                + times_vector(&model.b, &row(&trajectory.inputs, j));
-            (row(&trajectory.states, j + 1) - next).amax()
-        })
-        .fold(0.0, f64::max)
+/// max |z_0 - x| and |z_{j+1} - A z_j - B v_j|, with the artifact's own matrices.
+fn dynamics_residual(stages: &Stages<'_>, initial: &[f64], states: &[f64], inputs: &[f64]) -> f64 {
+    let model = &stages.artifact.model;
+    let (n, m) = (model.a.nrows(), model.b.ncols());
+    let differences =
+        |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    let mut worst = differences(&states[..n], initial);
+    let mut next = vec![0.0; n];
+    for (j, v) in inputs.chunks_exact(m).enumerate() {
+        let (z, reached) = (&states[j * n..][..n], &states[(j + 1) * n..][..n]);
+        let columns = model.a.as_slice().chunks_exact(n).chain(model.b.as_slice().chunks_exact(n));
+        next.fill(0.0);
+        for (column, weight) in columns.zip(z.iter().chain(v)) {
+            next.iter_mut().zip(column).for_each(|(next, entry)| *next += entry * weight);
+        }
+        worst = worst.max(differences(&next, reached));
+    }
+    worst
 }
 
 /// Why the measured state itself is refused, if it is. Checked once, at the mission's start:

@@ -20,6 +20,9 @@
 //! terminal set, which is feasible by construction. Apply the first input; after the step with
 //! N = 1 the mission is complete.
 //!
+//! Every command leaves with a certificate; [`verify_step`] makes it again from the answer alone,
+//! without a solver.
+//!
 //! # Guarantee and its assumptions
 //! If P_0 is feasible, w stays in W and lambda_bar > 0: every later step has an answer, no
 //! constraint is violated, the cost falls by lambda_bar a step, and x ends in {z^r_q} + S(N_q)
@@ -50,10 +53,12 @@ mod search;
 mod stages;
 mod state;
 mod step;
+mod verification;
 
 pub use answer::{
-    Arrival, Branch, Command, Diagnostics, MeasuredState, Measurement, PhysicalTrajectory, Plan,
-    PlanOutcome, RealisedDisturbance, Step, Trajectory, Trial, TrialOutcome, Tube, Verdict,
+    Arrival, Branch, Command, Diagnostics, Evidence, MeasuredState, Measurement,
+    PhysicalTrajectory, Plan, PlanOutcome, RealisedDisturbance, Step, Trajectory, Trial,
+    TrialOutcome, Tube, Verdict,
 };
 pub use artifact::{Artifact, Summary};
 pub use inspect::{HorizonAnswer, StateRows};
@@ -62,6 +67,7 @@ pub use problem::{
     TerminalPoint, Weights,
 };
 pub use state::State;
+pub use verification::verify_step;
 
 use super::{Controller, PrepareError, StepError};
 use crate::budget::Budget;

@@ -3,9 +3,10 @@
 use nalgebra::DVector;
 
 use super::{
-    Arrival, Artifact, Branch, Command, Diagnostics, MeasuredState, Measurement, Plan, PlanOutcome,
-    RealisedDisturbance, Scheme, Step, TerminalFallback, Trial, Tube, Verdict,
-    certify::{self, TOLERANCE, Verified},
+    Arrival, Artifact, Branch, Command, Diagnostics, Evidence, MeasuredState, Measurement, Plan,
+    PlanOutcome, RealisedDisturbance, Scheme, Step, TerminalFallback, Trajectory, Trial, Tube,
+    Verdict,
+    certify::{self, Statement, TOLERANCE, Verified},
     search::{Found, Goal, Proof, Search},
     stages::{Stages, Terminal},
     state::{Flight, State},
@@ -36,11 +37,7 @@ pub(super) fn step(
     budget: Budget<'_>,
 ) -> Result<Step, StepError> {
     let problem = &artifact.problem;
-    let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
-    if !state.fits(n, m, problem.steps_max, problem.horizon_max) {
-        return Err(StepError::State("it was not made by this controller".into()));
-    }
-    let measured = scaled_state(artifact, state.step, measurement)?;
+    let measured = measured_state(artifact, state, measurement)?;
     let Some(flight) = &state.flight else {
         return first_step(artifact, &measured, budget);
     };
@@ -50,11 +47,25 @@ pub(super) fn step(
     }
     let context = Context { artifact, step: state.step, flight, measured: &measured, disturbance };
     match problem.scheme {
-        Scheme::TubeOptimalControl => context.tube_feedback(budget),
+        Scheme::TubeOptimalControl => context.tube_feedback(),
         Scheme::AdaptiveTerminal | Scheme::FixedTerminal | Scheme::Nominal => {
             context.receding_horizon(budget)
         }
     }
+}
+
+/// The measured state in scaled units, if state and measurement fit the artifact.
+pub(super) fn measured_state(
+    artifact: &Artifact,
+    state: &State,
+    measurement: &Measurement,
+) -> Result<DVector<f64>, StepError> {
+    let problem = &artifact.problem;
+    let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
+    if !state.fits(n, m, problem.steps_max, problem.horizon_max) {
+        return Err(StepError::State("it was not made by this controller".into()));
+    }
+    scaled_state(artifact, state.step, measurement)
 }
 
 /// The plan from the mission's start.
@@ -83,8 +94,8 @@ pub(super) fn plan(
         final_generators: artifact.tube.sum(0..found.horizon).generators().clone(),
     });
     let flight = first_flight(&measured, &found, &verified);
-    let trials = search.restart();
-    let diagnostics = diagnostics(artifact, &search, &flight, Branch::TerminalPoint, trials);
+    let work = Work::of_all(&mut search);
+    let diagnostics = diagnostics(artifact, Branch::TerminalPoint, Some(&flight), work);
     Ok(PlanOutcome::Plan(Plan {
         commands,
         trajectory: verified.trajectory,
@@ -155,8 +166,8 @@ fn first_step(
     let mut search = start_search(artifact, measured, budget);
     match solve_first(&mut search)? {
         Err(infeasible) => {
-            let trials = search.restart();
-            Ok(infeasible_step(artifact, &search, &State::START, infeasible, None, trials))
+            let work = Work::of_all(&mut search);
+            Ok(infeasible_step(artifact, &State::START, infeasible, None, work))
         }
         Ok((verified, found)) => {
             let flight = first_flight(measured, &found, &verified);
@@ -167,8 +178,8 @@ fn first_step(
             } else {
                 Branch::TerminalPoint
             };
-            let trials = search.restart();
-            let diagnostics = diagnostics(artifact, &search, &flight, branch, trials);
+            let work = Work::of_all(&mut search);
+            let diagnostics = diagnostics(artifact, branch, Some(&flight), work);
             Ok(commanded(artifact, 0, flight, verified, None, diagnostics))
         }
     }
@@ -228,16 +239,7 @@ impl Context<'_> {
             if self.disturbance.outside_assumed_set {
                 infeasible.reason.push_str("; the last disturbance left the assumed set");
             }
-            let state = State { step: self.step, flight: Some(self.flight.clone()) };
-            let disturbance = Some(self.disturbance);
-            return Ok(infeasible_step(
-                self.artifact,
-                &search,
-                &state,
-                infeasible,
-                disturbance,
-                trials,
-            ));
+            return Ok(self.infeasible(infeasible, Work::of(&search, trials)));
         };
         let verified = certify::verify_found(&search, &settled.found);
         if !verified.certificate.passed {
@@ -245,7 +247,8 @@ impl Context<'_> {
             return self.previous_plan_tail(&mut search, trials, failure);
         }
         let flight = self.next_flight(&settled, &verified);
-        let mut diagnostics = diagnostics(self.artifact, &search, &flight, settled.branch, trials);
+        let work = Work::of(&search, trials);
+        let mut diagnostics = diagnostics(self.artifact, settled.branch, Some(&flight), work);
         diagnostics.point = settled.point;
         let disturbance = Some(self.disturbance);
         Ok(commanded(self.artifact, self.step, flight, verified, disturbance, diagnostics))
@@ -332,24 +335,15 @@ impl Context<'_> {
         if self.disturbance.outside_assumed_set || !artifact.is_tightened() {
             return Err(failure.into());
         }
-        let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
-        let horizon = self.flight.horizon - 1;
-        let nominal = nominal_states(artifact, &self.flight.plan_initial, &self.flight.plan_inputs);
-        let mut inputs = Vec::with_capacity(horizon * m);
-        let mut error = self.disturbance.components.clone();
-        for j in 0..horizon {
-            let correction = times_vector(&artifact.gain, &error);
-            let planned = &self.flight.plan_inputs[(j + 1) * m..][..m];
-            inputs.extend(planned.iter().zip(correction.iter()).map(|(v, c)| v + c));
-            error = times_vector(&artifact.closed_loop, &error);
-        }
-        let end = &nominal[(horizon + 1) * n..];
-        let centre: Vec<f64> = end.iter().zip(error.iter()).map(|(z, e)| z + e).collect();
-        let terminal = Terminal { centre, generators: Vec::new(), constrain_last: false };
+        let tail = PlanTail::new(artifact, self.flight, &self.disturbance.components);
+        let horizon = tail.horizon;
         search.stages.extend_to(horizon);
-        let program = search.stages.program(horizon, &terminal);
+        let program = search.stages.program(horizon, &tail.terminal);
         let claim = Claim::PreviousPlanTail;
-        let verified = certify::verify_inputs(search, &program, &inputs, &[], claim, None);
+        let statement = Statement { claim, cost: None, lower_bound: None };
+        let nothing = Evidence::default();
+        let verified =
+            certify::verify_inputs(&search.stages, &program, &tail.inputs, nothing, statement);
         if !verified.certificate.passed {
             return Err(failure.into());
         }
@@ -365,36 +359,22 @@ impl Context<'_> {
             powers,
             plan_step: self.step,
             plan_initial: self.measured.as_slice().to_vec(),
-            plan_inputs: inputs,
+            plan_inputs: tail.inputs,
             basis: Basis::default(),
             ..self.flight.clone()
         };
-        let branch = Branch::PreviousPlanTail;
-        let diagnostics = diagnostics(artifact, search, &flight, branch, trials);
+        let work = Work::of(search, trials);
+        let diagnostics = diagnostics(artifact, Branch::PreviousPlanTail, Some(&flight), work);
         let disturbance = Some(self.disturbance);
         Ok(commanded(artifact, self.step, flight, verified, disturbance, diagnostics))
     }
 
     /// u = v + K (x - z) around the plan of step 0. [Quartullo2025a, eq. 16]
-    fn tube_feedback(self, budget: Budget<'_>) -> Result<Step, StepError> {
+    fn tube_feedback(self) -> Result<Step, StepError> {
         let artifact = self.artifact;
-        let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
-        let plan = &self.flight.plan_inputs;
-        let nominal = nominal_states(artifact, &self.flight.plan_initial, plan);
+        let whole = verified_plan(artifact, self.flight);
         let since = self.step - self.flight.plan_step;
-        let z = DVector::from_column_slice(&nominal[since * n..][..n]);
-        let v = DVector::from_column_slice(&plan[since * m..][..m]);
-        let input = v + times_vector(&artifact.gain, &(self.measured - z));
-        let start = Stages::new(artifact, self.flight.plan_step, &self.flight.plan_initial);
-        let mut search = Search::new(start, None, budget);
-        let horizon = plan.len() / m;
-        search.stages.extend_to(horizon);
-        let centre = self.flight.centre.clone();
-        let terminal = Terminal { centre, generators: Vec::new(), constrain_last: false };
-        let program = search.stages.program(horizon, &terminal);
-        let claim = Claim::FixedHorizon;
-        let bound = Some(self.flight.cost);
-        let mut verified = certify::verify_inputs(&search, &program, plan, &[], claim, bound);
+        let input = fed_back_input(artifact, &whole.trajectory, since, self.measured);
         if let Some(excess) = artifact.input_excess(&input) {
             let infeasible = Infeasibility {
                 reason: format!(
@@ -406,31 +386,94 @@ impl Context<'_> {
                 relaxations: Vec::new(),
                 all_horizons_proved: false,
             };
-            let state = State { step: self.step, flight: Some(self.flight.clone()) };
-            let disturbance = Some(self.disturbance);
-            let none = Vec::new();
-            return Ok(infeasible_step(artifact, &search, &state, infeasible, disturbance, none));
+            return Ok(self.infeasible(infeasible, Work::default()));
         }
-        if !verified.certificate.passed {
-            return Err(uncertified(&verified).into());
+        if !whole.certificate.passed {
+            return Err(uncertified(&whole).into());
         }
-        // What is ahead of the present step.
-        let left = horizon - since;
-        let whole = &verified.trajectory;
-        verified.trajectory = super::Trajectory {
-            states: whole.states.rows(since, left + 1).into_owned(),
-            inputs: whole.inputs.rows(since, left).into_owned(),
-        };
+        let verified = Verified { trajectory: ahead(&whole.trajectory, since), ..whole };
         let flight = Flight {
             previous_state: self.measured.clone(),
-            previous_input: input.clone(),
-            horizon: left,
+            previous_input: input,
+            horizon: verified.trajectory.horizon(),
             ..self.flight.clone()
         };
-        let branch = Branch::TubeFeedback;
-        let diagnostics = diagnostics(artifact, &search, &flight, branch, Vec::new());
+        let diagnostics =
+            diagnostics(artifact, Branch::TubeFeedback, Some(&flight), Work::default());
         let disturbance = Some(self.disturbance);
         Ok(commanded(artifact, self.step, flight, verified, disturbance, diagnostics))
+    }
+
+    fn infeasible(self, infeasible: Infeasibility, work: Work) -> Step {
+        let state = State { step: self.step, flight: Some(self.flight.clone()) };
+        let disturbance = Some(self.disturbance);
+        infeasible_step(self.artifact, &state, infeasible, disturbance, work)
+    }
+}
+
+/// The candidate of the recursive-feasibility proof [Quartullo2025a, eq. A5]: the previous plan
+/// without its first input, corrected by v(j) + K A_K^j w, and the point where it ends.
+pub(super) struct PlanTail {
+    pub(super) horizon: usize,
+    /// N m values.
+    pub(super) inputs: Vec<f64>,
+    pub(super) terminal: Terminal,
+}
+
+impl PlanTail {
+    pub(super) fn new(artifact: &Artifact, flight: &Flight, disturbance: &DVector<f64>) -> Self {
+        let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
+        let horizon = flight.horizon - 1;
+        let nominal = nominal_states(artifact, &flight.plan_initial, &flight.plan_inputs);
+        let mut inputs = Vec::with_capacity(horizon * m);
+        let mut error = disturbance.clone();
+        for j in 0..horizon {
+            let correction = times_vector(&artifact.gain, &error);
+            let planned = &flight.plan_inputs[(j + 1) * m..][..m];
+            inputs.extend(planned.iter().zip(correction.iter()).map(|(v, c)| v + c));
+            error = times_vector(&artifact.closed_loop, &error);
+        }
+        let end = &nominal[(horizon + 1) * n..];
+        let centre = end.iter().zip(error.iter()).map(|(z, e)| z + e).collect();
+        let terminal = Terminal { centre, generators: Vec::new(), constrain_last: false };
+        Self { horizon, inputs, terminal }
+    }
+}
+
+/// The plan of step 0, as tube feedback follows it, verified as a whole.
+pub(super) fn verified_plan(artifact: &Artifact, flight: &Flight) -> Verified {
+    let mut stages = Stages::new(artifact, flight.plan_step, &flight.plan_initial);
+    let horizon = flight.plan_inputs.len() / artifact.tables.inputs();
+    stages.extend_to(horizon);
+    let centre = flight.centre.clone();
+    let terminal = Terminal { centre, generators: Vec::new(), constrain_last: false };
+    let program = stages.program(horizon, &terminal);
+    let statement = Statement {
+        claim: Claim::FixedHorizon,
+        cost: Some(flight.cost),
+        lower_bound: Some(flight.cost),
+    };
+    let nothing = Evidence::default();
+    certify::verify_inputs(&stages, &program, &flight.plan_inputs, nothing, statement)
+}
+
+/// u = v + K (x - z) around a plan, `since` steps after its start. [Quartullo2025a, eq. 16]
+pub(super) fn fed_back_input(
+    artifact: &Artifact,
+    plan: &Trajectory,
+    since: usize,
+    measured: &DVector<f64>,
+) -> DVector<f64> {
+    let deviation = measured - plan.states.row(since).transpose();
+    plan.inputs.row(since).transpose() + times_vector(&artifact.gain, &deviation)
+}
+
+/// What is left of a plan `since` steps after its start.
+pub(super) fn ahead(plan: &Trajectory, since: usize) -> Trajectory {
+    let left = plan.horizon() - since;
+    Trajectory {
+        states: plan.states.rows(since, left + 1).into_owned(),
+        inputs: plan.inputs.rows(since, left).into_owned(),
     }
 }
 
@@ -457,12 +500,18 @@ fn commanded(
         next: State { step: step + 1, flight: Some(flight) },
         trajectory: Some(verified.trajectory),
         certificate: Some(verified.certificate),
+        evidence: Some(verified.evidence),
         disturbance,
         diagnostics,
     }
 }
 
-fn command(artifact: &Artifact, step: usize, input: DVector<f64>, last: bool) -> Command {
+pub(super) fn command(
+    artifact: &Artifact,
+    step: usize,
+    input: DVector<f64>,
+    last: bool,
+) -> Command {
     let accelerations = artifact.model.scaling.map(|scaling| {
         let unit = scaling.acceleration_unit_m_s2;
         [0, 1, 2].map(|i| crate::units::Acceleration::from_m_s2(input[i] * unit))
@@ -486,56 +535,68 @@ fn command(artifact: &Artifact, step: usize, input: DVector<f64>, last: bool) ->
 
 fn infeasible_step(
     artifact: &Artifact,
-    search: &Search<'_, '_>,
     state: &State,
     infeasible: Infeasibility,
     disturbance: Option<RealisedDisturbance>,
-    trials: Vec<Trial>,
+    work: Work,
 ) -> Step {
-    let centre = DVector::zeros(artifact.tables.states());
     Step {
         index: state.step,
         verdict: Verdict::Infeasible(infeasible),
         next: state.clone(),
         trajectory: None,
         certificate: None,
+        evidence: None,
         disturbance,
-        diagnostics: Diagnostics {
-            branch: Branch::None,
-            cost: 0.0,
-            horizon: 0,
-            point: None,
-            adapted_step: state.flight.as_ref().map_or(0, |flight| flight.adapted_step),
-            adapted_horizon: state.flight.as_ref().map_or(0, |flight| flight.adapted_horizon),
-            terminal_set_powers: Vec::new(),
-            terminal_centre: centre,
-            trials,
-            simplex_pivots: search.pivots,
-            general_solver_calls: search.general_solver_calls,
-            lambda: artifact.decrease.lambda_bar,
-        },
+        diagnostics: diagnostics(artifact, Branch::None, state.flight.as_ref(), work),
     }
 }
 
+/// What the solvers did for one answer.
+#[derive(Default)]
+struct Work {
+    trials: Vec<Trial>,
+    simplex_pivots: usize,
+    general_solver_calls: usize,
+}
+
+impl Work {
+    fn of_all(search: &mut Search<'_, '_>) -> Self {
+        let trials = search.restart();
+        Self::of(search, trials)
+    }
+
+    fn of(search: &Search<'_, '_>, trials: Vec<Trial>) -> Self {
+        Self {
+            trials,
+            simplex_pivots: search.pivots,
+            general_solver_calls: search.general_solver_calls,
+        }
+    }
+}
+
+/// `flight`: what the answer hands on; without a command ([`Branch::None`]) what it was given.
 fn diagnostics(
     artifact: &Artifact,
-    search: &Search<'_, '_>,
-    flight: &Flight,
     branch: Branch,
-    trials: Vec<Trial>,
+    flight: Option<&Flight>,
+    work: Work,
 ) -> Diagnostics {
+    let decided = flight.filter(|_| branch != Branch::None).map(|f| (f.cost, f.horizon));
+    let (cost, horizon) = decided.unwrap_or((0.0, 0));
+    let centre = flight.map(|flight| DVector::from_column_slice(&flight.centre));
     Diagnostics {
         branch,
-        cost: flight.cost,
-        horizon: flight.horizon,
-        point: (branch == Branch::TerminalPoint).then_some((flight.cost, flight.horizon)),
-        adapted_step: flight.adapted_step,
-        adapted_horizon: flight.adapted_horizon,
-        terminal_set_powers: flight.powers.clone(),
-        terminal_centre: DVector::from_column_slice(&flight.centre),
-        trials,
-        simplex_pivots: search.pivots,
-        general_solver_calls: search.general_solver_calls,
+        cost,
+        horizon,
+        point: decided.filter(|_| branch == Branch::TerminalPoint),
+        adapted_step: flight.map_or(0, |flight| flight.adapted_step),
+        adapted_horizon: flight.map_or(0, |flight| flight.adapted_horizon),
+        terminal_set_powers: flight.map_or_else(Vec::new, |flight| flight.powers.clone()),
+        terminal_centre: centre.unwrap_or_else(|| DVector::zeros(artifact.tables.states())),
+        trials: work.trials,
+        simplex_pivots: work.simplex_pivots,
+        general_solver_calls: work.general_solver_calls,
         lambda: artifact.decrease.lambda_bar,
     }
 }
@@ -566,21 +627,9 @@ fn arrive(
         next: state.clone(),
         trajectory: None,
         certificate: None,
+        evidence: None,
         disturbance: Some(disturbance),
-        diagnostics: Diagnostics {
-            branch: Branch::None,
-            cost: 0.0,
-            horizon: 0,
-            point: None,
-            adapted_step: flight.adapted_step,
-            adapted_horizon: flight.adapted_horizon,
-            terminal_set_powers: flight.powers.clone(),
-            terminal_centre: DVector::from_column_slice(&flight.centre),
-            trials: Vec::new(),
-            simplex_pivots: 0,
-            general_solver_calls: 0,
-            lambda: artifact.decrease.lambda_bar,
-        },
+        diagnostics: diagnostics(artifact, Branch::None, Some(flight), Work::default()),
     }
 }
 
@@ -601,7 +650,7 @@ fn inside_final_set(artifact: &Artifact, flight: &Flight, measured: &DVector<f64
     zonotope_gauge(set.generators(), &deviation).is_some_and(|gauge| gauge <= 1.0 + GAUGE_TOLERANCE)
 }
 
-fn realised_disturbance(
+pub(super) fn realised_disturbance(
     artifact: &Artifact,
     flight: &Flight,
     measured: &DVector<f64>,
