@@ -150,6 +150,14 @@ pub enum StepError {
     Measurement(Vec<Fault>),
     /// The controller state does not fit the artifact.
     State(String),
+    /// More steps went by without a measurement than the last answer planned commands for: what
+    /// was flown since is not known.
+    PlanExhausted {
+        /// Steps without a measurement.
+        missed: usize,
+        /// Commands that the last answer planned beyond its own.
+        commands_left: usize,
+    },
     /// We are at fault.
     Failure(Failure),
 }

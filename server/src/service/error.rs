@@ -101,6 +101,14 @@ impl Error {
         match fault {
             StepError::Measurement(faults) => Violations::under(prefix, faults).into(),
             StepError::State(what) => StateFault::Payload(what).into(),
+            StepError::PlanExhausted { missed, commands_left } => {
+                let message = format!(
+                    "{missed} steps were missed, but the last answer planned only {commands_left} \
+                     commands beyond its own: what was flown since is not known. Start a new \
+                     mission from this measurement"
+                );
+                Self::new(Code::FailedPrecondition, "PLAN_EXHAUSTED", message)
+            }
             StepError::Failure(failure) => failure.into(),
         }
     }

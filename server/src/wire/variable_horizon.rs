@@ -874,6 +874,8 @@ fn render_disturbance(disturbance: &method::RealisedDisturbance) -> v1::Realised
         gauge: disturbance.gauge,
         residual_norm_nd: disturbance.residual_norm,
         outside_assumed_set: disturbance.outside_assumed_set,
+        steps: count(disturbance.steps),
+        outside_guaranteed_tube: disturbance.outside_guaranteed_tube,
     }
 }
 
@@ -907,5 +909,6 @@ fn render_diagnostics(diagnostics: &method::Diagnostics) -> v1::VariableHorizonD
         simplex_pivots: count(diagnostics.simplex_pivots),
         general_solver_calls: count(diagnostics.general_solver_calls),
         lambda: diagnostics.lambda,
+        missed_steps: count(diagnostics.missed_steps),
     }
 }

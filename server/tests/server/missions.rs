@@ -84,9 +84,14 @@ fn descriptor<M: prost::Name>() -> MessageDescriptor {
 
 /// The state that `prediction` says will be measured next if no disturbance acts.
 pub(crate) fn predicted(answer: &v1::StepResponse, elapsed_s: f64) -> Value {
+    predicted_after(answer, 1, elapsed_s)
+}
+
+/// The same, `steps` steps on.
+pub(crate) fn predicted_after(answer: &v1::StepResponse, steps: usize, elapsed_s: f64) -> Value {
     let prediction = answer.prediction.as_ref().expect("it was asked for");
     let row = |matrix: &Option<v1::Matrix>| {
-        matrix.as_ref().expect("a spacecraft's").values[3..6].to_vec()
+        matrix.as_ref().expect("a spacecraft's").values[3 * steps..][..3].to_vec()
     };
     json!({
         "relative": {

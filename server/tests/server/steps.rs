@@ -10,7 +10,7 @@ use vbar_server::{Config, Limits};
 
 use crate::{
     missions,
-    support::{Server, detail, json_fields, server, server_with, step_request},
+    support::{Server, detail, grpc_fields, json_fields, server, server_with, step_request},
 };
 
 async fn artifact_id(server: &Server, problem: Value) -> String {
@@ -78,6 +78,53 @@ async fn step_loop_over_both_transports_gives_the_same_answers() {
         let Some(Verdict::Command(command)) = &over_http.verdict else { panic!("{over_http:?}") };
         let elapsed = command.elapsed_s + command.duration_s.unwrap();
         measurement = missions::predicted(&over_http, elapsed);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn step_after_missed_ones_is_answered_over_both_transports() {
+    let server = server().await;
+    let id = artifact_id(&server, missions::envisat()).await;
+    let first = json!({ "artifactId": id, "measurement": missions::envisat_start() });
+    let first = server.post("/v1/step", &first).await.json();
+    let state = first["controllerState"].clone();
+    let first: v1::StepResponse = missions::message(first);
+    let Some(Verdict::Command(command)) = &first.verdict else { panic!("{first:?}") };
+    let sample_time_s = command.duration_s.unwrap();
+    let request = |step: usize, elapsed_s: f64| {
+        let measurement = missions::predicted_after(&first, step, elapsed_s);
+        json!({ "artifactId": id, "controllerState": state, "measurement": measurement })
+    };
+    // The measurements of steps 1 and 2 never came.
+    let late = request(3, 3.0 * sample_time_s);
+    let answer = server.post("/v1/step", &late).await;
+    assert_eq!(answer.status, 200, "{}", answer.text());
+    assert_eq!(answer.json()["variableHorizon"]["missedSteps"], 2);
+    let answer: v1::StepResponse = missions::message(answer.json());
+    assert_eq!(answer, step(&server, &missions::message(late)).await);
+    assert_eq!(answer.step_index, 3);
+    assert!(answer.certificate.as_ref().unwrap().passed);
+    let realised = answer.realised_disturbance.as_ref().unwrap();
+    assert_eq!(realised.steps, 3);
+    assert!(!realised.outside_assumed_set && !realised.outside_guaranteed_tube, "{realised:?}");
+    // N = 26 at step 0: after step 26 nobody knows what was flown.
+    let beyond = request(26, 27.0 * sample_time_s);
+    let message = missions::message::<v1::StepRequest>(beyond.clone());
+    let status = server.grpc().await.step(message).await.unwrap_err();
+    assert_eq!(status.code(), Code::FailedPrecondition, "{status}");
+    let error = server.post("/v1/step", &beyond).await.json();
+    assert_eq!(error["code"], 9, "{error}");
+    assert_eq!(detail(&error, "ErrorInfo").unwrap()["reason"], "PLAN_EXHAUSTED");
+    // Early, or between two steps: the request is at fault.
+    for elapsed_s in [0.0, 2.5 * sample_time_s] {
+        let wrong = request(1, elapsed_s);
+        let error = server.post("/v1/step", &wrong).await.json();
+        assert_eq!(error["code"], 3, "{error}");
+        assert_eq!(json_fields(&error), ["measurement.elapsed_s"]);
+        let status = server.grpc().await.step(missions::message::<v1::StepRequest>(wrong)).await;
+        let status = status.unwrap_err();
+        assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+        assert_eq!(grpc_fields(&status), ["measurement.elapsed_s"]);
     }
 }
 

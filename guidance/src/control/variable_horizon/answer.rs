@@ -15,7 +15,8 @@ use crate::{
 pub struct Measurement {
     /// The state.
     pub state: MeasuredState,
-    /// Time since the mission's start; must equal the step's time, where the plant has one.
+    /// Time since the mission's start; must equal the step's time, where the plant has one, or be
+    /// a whole number of steps later: then those in between were missed.
     pub elapsed: Option<Seconds>,
 }
 
@@ -121,14 +122,23 @@ pub struct Evidence {
 /// The disturbance since the previous step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RealisedDisturbance {
-    /// w = x(k) - A x(k-1) - B u(k-1), scaled.
+    /// w = x(k) - A x(k-1) - B u(k-1), scaled; after m missed steps x(k) less the state that the
+    /// planned inputs lead to from the last measurement.
     pub components: DVector<f64>,
     /// Least t with the projection of w on the span of the generators in t W; `None` if W = {0}.
+    /// After m missed steps W + A W + ... + A^m W takes the place of W.
     pub gauge: Option<f64>,
     /// Norm of the part of w outside that span.
     pub residual_norm: f64,
-    /// w is not in W: the guarantee is void from here on.
+    /// w is not in that set: some disturbance left W, and the guarantee is void from here on.
     pub outside_assumed_set: bool,
+    /// Steps over which it acted: 1, or m + 1 after m missed steps.
+    pub steps: usize,
+    /// The last answer's guarantee does not reach over these steps. The same as
+    /// `outside_assumed_set`, unless steps were missed: then nothing held the deviation in the
+    /// tube, and although W was kept it can lie outside S(m + 1). What was promised of feasibility
+    /// and decrease ends; if this answer gives a command, it promises the same anew.
+    pub outside_guaranteed_tube: bool,
 }
 
 /// How a step came about.
@@ -156,8 +166,11 @@ pub struct Diagnostics {
     pub simplex_pivots: usize,
     /// Programs handed to the general solver because the simplex reported trouble.
     pub general_solver_calls: usize,
-    /// Required decrease of the cost.
+    /// Required decrease of the cost, for each step.
     pub lambda: f64,
+    /// Steps before this one for which no measurement came: their commands were taken to be those
+    /// that the last answer planned.
+    pub missed_steps: usize,
 }
 
 /// Which problem gave the command.

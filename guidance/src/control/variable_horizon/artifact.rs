@@ -188,11 +188,6 @@ impl Artifact {
         }
     }
 
-    /// W has more generators than their span has dimensions.
-    pub(super) fn has_dependent_generators(&self) -> bool {
-        self.model.disturbance.generators().ncols() > self.disturbance_measure.rank()
-    }
-
     /// By how much an input lies outside U, if it does by more than rounding.
     pub(super) fn input_excess(&self, input: &DVector<f64>) -> Option<f64> {
         let bounds = self.model.input_lower.iter().zip(self.model.input_upper.iter());

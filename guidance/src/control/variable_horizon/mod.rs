@@ -20,6 +20,12 @@
 //! terminal set, which is feasible by construction. Apply the first input; after the step with
 //! N = 1 the mission is complete.
 //!
+//! A measurement that comes m whole steps late is answered for the step whose time it has. The
+//! commands of the steps in between are taken to be those that the last answer planned, v(1), v(2),
+//! ..., flown as they are: what a chaser that holds the prediction can do without us. If more
+//! steps are missed than the plan has commands, nobody knows what was flown, and the step is
+//! refused.
+//!
 //! Every command leaves with a certificate; [`verify_step`] makes it again from the answer alone,
 //! without a solver.
 //!
@@ -29,6 +35,13 @@
 //! after at most J_0 / lambda_bar steps. Every step reports the disturbance that acted and
 //! whether it left W. The guarantee holds for a local search too: it needs decrease, not optima.
 //! It says nothing between samples.
+//!
+//! Over m missed steps the deviation from the plan grows with A instead of A_K. If it still lies in
+//! S(m + 1), it is one that the feasibility proof covers as it stands: P_k has an answer whose
+//! cost has fallen by (m + 1) lambda_bar, for the candidate v + K A_K^j e costs at most that by
+//! the same triangle inequality as for one step. If not, nothing is promised for this step: the
+//! answer says so (`outside_guaranteed_tube`), no decrease is asked of it, and the guarantee
+//! starts anew with it.
 //!
 //! # Where we differ from the papers
 //! - Line 11 of Algorithm 1 gets a tolerance of 1e-9 (1 + |J|): equality is normal for W = {0}
@@ -48,6 +61,7 @@ mod artifact;
 mod certify;
 mod encoding;
 mod inspect;
+mod present;
 mod problem;
 mod search;
 mod stages;

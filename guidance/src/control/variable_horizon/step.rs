@@ -3,28 +3,24 @@
 use nalgebra::DVector;
 
 use super::{
-    Arrival, Artifact, Branch, Command, Diagnostics, Evidence, MeasuredState, Measurement, Plan,
-    PlanOutcome, RealisedDisturbance, Scheme, Step, TerminalFallback, Trajectory, Trial, Tube,
-    Verdict,
+    Arrival, Artifact, Branch, Command, Diagnostics, Evidence, Measurement, Plan, PlanOutcome,
+    RealisedDisturbance, Scheme, Step, TerminalFallback, Trajectory, Trial, Tube, Verdict,
     certify::{self, Statement, TOLERANCE, Verified},
+    present::{Behind, GAUGE_TOLERANCE, Present},
     search::{Found, Goal, Proof, Search},
     stages::{Stages, Terminal},
     state::{Flight, State},
 };
 use crate::{
     budget::{Budget, Interruption},
-    control::{Claim, Failure, Fault, Infeasibility, StepError},
+    control::{Claim, Failure, Infeasibility, StepError},
     matrices::times_vector,
     program::{Basis, zonotope_gauge},
     units::{Force, Seconds},
 };
 
-/// A measurement must be this near to its step's time, as a share of the sample time.
-const EPOCH_TOLERANCE: f64 = 1e-3;
 /// Equality is normal in line 11 for W = {0} or without fuel weight: not a failure to decrease.
 const DECREASE_TOLERANCE: f64 = 1e-9;
-/// A gauge up to here is inside the assumed set: unit conversions round.
-const GAUGE_TOLERANCE: f64 = 1e-6;
 
 /// Decides the next command.
 ///
@@ -36,36 +32,20 @@ pub(super) fn step(
     measurement: &Measurement,
     budget: Budget<'_>,
 ) -> Result<Step, StepError> {
-    let problem = &artifact.problem;
-    let measured = measured_state(artifact, state, measurement)?;
-    let Some(flight) = &state.flight else {
-        return first_step(artifact, &measured, budget);
+    let present = Present::new(artifact, state, measurement)?;
+    let Some(behind) = &present.behind else {
+        return first_step(artifact, &present.measured, budget);
     };
-    let disturbance = realised_disturbance(artifact, flight, &measured);
-    if flight.horizon == 1 {
-        return Ok(arrive(artifact, state, flight, &measured, disturbance));
+    if behind.flight.horizon == 1 {
+        return Ok(arrive(&present, behind));
     }
-    let context = Context { artifact, step: state.step, flight, measured: &measured, disturbance };
-    match problem.scheme {
+    let context = Context { present: &present, behind };
+    match artifact.problem.scheme {
         Scheme::TubeOptimalControl => context.tube_feedback(),
         Scheme::AdaptiveTerminal | Scheme::FixedTerminal | Scheme::Nominal => {
             context.receding_horizon(budget)
         }
     }
-}
-
-/// The measured state in scaled units, if state and measurement fit the artifact.
-pub(super) fn measured_state(
-    artifact: &Artifact,
-    state: &State,
-    measurement: &Measurement,
-) -> Result<DVector<f64>, StepError> {
-    let problem = &artifact.problem;
-    let (n, m) = (artifact.tables.states(), artifact.tables.inputs());
-    if !state.fits(n, m, problem.steps_max, problem.horizon_max) {
-        return Err(StepError::State("it was not made by this controller".into()));
-    }
-    scaled_state(artifact, state.step, measurement)
 }
 
 /// The plan from the mission's start.
@@ -77,7 +57,7 @@ pub(super) fn plan(
     initial: &Measurement,
     budget: Budget<'_>,
 ) -> Result<PlanOutcome, StepError> {
-    let measured = scaled_state(artifact, 0, initial)?;
+    let measured = Present::new(artifact, &State::START, initial)?.measured;
     let mut search = start_search(artifact, &measured, budget);
     let (verified, found) = match solve_first(&mut search)? {
         Ok(solved) => solved,
@@ -167,7 +147,16 @@ fn first_step(
     match solve_first(&mut search)? {
         Err(infeasible) => {
             let work = Work::of_all(&mut search);
-            Ok(infeasible_step(artifact, &State::START, infeasible, None, work))
+            Ok(Step {
+                index: 0,
+                verdict: Verdict::Infeasible(infeasible),
+                next: State::START,
+                trajectory: None,
+                certificate: None,
+                evidence: None,
+                disturbance: None,
+                diagnostics: diagnostics(artifact, Branch::None, None, work),
+            })
         }
         Ok((verified, found)) => {
             let flight = first_flight(measured, &found, &verified);
@@ -203,12 +192,10 @@ fn first_flight(measured: &DVector<f64>, found: &Found, verified: &Verified) -> 
 }
 
 /// A step after the first.
+#[derive(Clone, Copy)]
 struct Context<'a> {
-    artifact: &'a Artifact,
-    step: usize,
-    flight: &'a Flight,
-    measured: &'a DVector<f64>,
-    disturbance: RealisedDisturbance,
+    present: &'a Present<'a>,
+    behind: &'a Behind<'a>,
 }
 
 /// What a receding-horizon step settled on.
@@ -222,8 +209,10 @@ struct Settled {
 
 impl Context<'_> {
     fn receding_horizon(self, budget: Budget<'_>) -> Result<Step, StepError> {
-        let stages = Stages::new(self.artifact, self.step, self.measured.as_slice());
-        let mut search = Search::new(stages, Some(self.flight.basis.shifted()), budget);
+        let Present { artifact, step, ref measured, .. } = *self.present;
+        let stages = Stages::new(artifact, step, measured.as_slice());
+        let start = self.behind.flight.basis.shifted();
+        let mut search = Search::new(stages, Some(start), budget);
         let mut trials = Vec::new();
         let settled = match self.settle(&mut search, &mut trials) {
             Ok(settled) => settled,
@@ -236,8 +225,8 @@ impl Context<'_> {
         let Some(settled) = settled else {
             let limit = search.stages.horizon_limit();
             let mut infeasible = certify::name_infeasibility(&mut search, limit);
-            if self.disturbance.outside_assumed_set {
-                infeasible.reason.push_str("; the last disturbance left the assumed set");
+            if let Some(excuse) = self.behind.excuse() {
+                infeasible.reason.push_str(excuse);
             }
             return Ok(self.infeasible(infeasible, Work::of(&search, trials)));
         };
@@ -248,10 +237,9 @@ impl Context<'_> {
         }
         let flight = self.next_flight(&settled, &verified);
         let work = Work::of(&search, trials);
-        let mut diagnostics = diagnostics(self.artifact, settled.branch, Some(&flight), work);
+        let mut diagnostics = self.diagnostics(settled.branch, &flight, work);
         diagnostics.point = settled.point;
-        let disturbance = Some(self.disturbance);
-        Ok(commanded(self.artifact, self.step, flight, verified, disturbance, diagnostics))
+        Ok(self.commanded(flight, verified, diagnostics))
     }
 
     /// Lines 10 to 20 of Algorithm 1; for the baselines line 10 only. `None`: infeasible.
@@ -260,11 +248,13 @@ impl Context<'_> {
         search: &mut Search<'_, '_>,
         trials: &mut Vec<Trial>,
     ) -> Result<Option<Settled>, Failure> {
-        let flight = self.flight;
+        let artifact = self.present.artifact;
+        let flight = &*self.behind.flight;
         let limit = search.stages.horizon_limit();
-        let adaptive = self.artifact.is_adaptive();
-        let cost_max = if adaptive {
-            flight.cost - self.artifact.decrease.lambda_bar
+        let adaptive = artifact.is_adaptive();
+        // A deviation that no feedback bounded ends the promised decrease; it starts anew here.
+        let cost_max = if adaptive && !self.behind.lost_the_tube() {
+            flight.cost - artifact.decrease.lambda_bar
                 + DECREASE_TOLERANCE * (1.0 + flight.cost.abs())
         } else {
             f64::INFINITY
@@ -275,7 +265,7 @@ impl Context<'_> {
         };
         let point = found.as_ref().map(|found| (found.cost, found.horizon));
         if let Some(found) = found.filter(|found| found.cost <= cost_max) {
-            let own_set = self.artifact.problem.scheme == Scheme::FixedTerminal;
+            let own_set = artifact.problem.scheme == Scheme::FixedTerminal;
             let branch = if own_set { Branch::TerminalSet } else { Branch::TerminalPoint };
             return Ok(Some(Settled { found, branch, point, powers: Vec::new() }));
         }
@@ -286,7 +276,7 @@ impl Context<'_> {
         let mut powers = flight.powers.clone();
         powers.push(flight.horizon - 1);
         let horizon = flight.horizon - 1;
-        let found = match self.artifact.problem.fallback {
+        let found = match artifact.problem.fallback {
             TerminalFallback::PreviousHorizon => {
                 let centre = flight.centre.clone();
                 search.fixed(&Goal::GrownFixed { centre, powers: powers.clone() }, horizon)?
@@ -303,19 +293,19 @@ impl Context<'_> {
     }
 
     fn next_flight(&self, settled: &Settled, verified: &Verified) -> Flight {
-        let found = &settled.found;
+        let (found, present, before) = (&settled.found, self.present, &self.behind.flight);
         let adapted = settled.powers.is_empty();
         Flight {
-            previous_state: self.measured.clone(),
+            previous_state: present.measured.clone(),
             previous_input: verified.trajectory.inputs.row(0).transpose(),
             cost: found.cost,
             horizon: found.horizon,
-            adapted_step: if adapted { self.step } else { self.flight.adapted_step },
-            adapted_horizon: if adapted { found.horizon } else { self.flight.adapted_horizon },
+            adapted_step: if adapted { present.step } else { before.adapted_step },
+            adapted_horizon: if adapted { found.horizon } else { before.adapted_horizon },
             centre: found.terminal.centre.clone(),
             powers: settled.powers.clone(),
-            plan_step: self.step,
-            plan_initial: self.measured.as_slice().to_vec(),
+            plan_step: present.step,
+            plan_initial: present.measured.as_slice().to_vec(),
             plan_inputs: found.solution.inputs.clone(),
             basis: found.solution.basis.clone(),
         }
@@ -331,11 +321,12 @@ impl Context<'_> {
         failure: Failure,
     ) -> Result<Step, StepError> {
         trials.append(&mut search.restart());
-        let artifact = self.artifact;
-        if self.disturbance.outside_assumed_set || !artifact.is_tightened() {
+        let Present { artifact, step, ref measured, .. } = *self.present;
+        let before = &*self.behind.flight;
+        if self.behind.disturbance.outside_guaranteed_tube || !artifact.is_tightened() {
             return Err(failure.into());
         }
-        let tail = PlanTail::new(artifact, self.flight, &self.disturbance.components);
+        let tail = PlanTail::new(artifact, before, &self.behind.disturbance.components);
         let horizon = tail.horizon;
         search.stages.extend_to(horizon);
         let program = search.stages.program(horizon, &tail.terminal);
@@ -347,41 +338,41 @@ impl Context<'_> {
         if !verified.certificate.passed {
             return Err(failure.into());
         }
-        let mut powers = self.flight.powers.clone();
+        let mut powers = before.powers.clone();
         if artifact.is_adaptive() {
             powers.push(horizon);
         }
         let flight = Flight {
-            previous_state: self.measured.clone(),
+            previous_state: measured.clone(),
             previous_input: verified.trajectory.inputs.row(0).transpose(),
             cost: verified.certificate.cost,
             horizon,
             powers,
-            plan_step: self.step,
-            plan_initial: self.measured.as_slice().to_vec(),
+            plan_step: step,
+            plan_initial: measured.as_slice().to_vec(),
             plan_inputs: tail.inputs,
             basis: Basis::default(),
-            ..self.flight.clone()
+            ..before.clone()
         };
         let work = Work::of(search, trials);
-        let diagnostics = diagnostics(artifact, Branch::PreviousPlanTail, Some(&flight), work);
-        let disturbance = Some(self.disturbance);
-        Ok(commanded(artifact, self.step, flight, verified, disturbance, diagnostics))
+        let diagnostics = self.diagnostics(Branch::PreviousPlanTail, &flight, work);
+        Ok(self.commanded(flight, verified, diagnostics))
     }
 
     /// u = v + K (x - z) around the plan of step 0. [Quartullo2025a, eq. 16]
     fn tube_feedback(self) -> Result<Step, StepError> {
-        let artifact = self.artifact;
-        let whole = verified_plan(artifact, self.flight);
-        let since = self.step - self.flight.plan_step;
-        let input = fed_back_input(artifact, &whole.trajectory, since, self.measured);
+        let Present { artifact, step, ref measured, .. } = *self.present;
+        let before = &*self.behind.flight;
+        let whole = verified_plan(artifact, before);
+        let since = step - before.plan_step;
+        let input = fed_back_input(artifact, &whole.trajectory, since, measured);
         if let Some(excess) = artifact.input_excess(&input) {
             let infeasible = Infeasibility {
                 reason: format!(
                     "the tube feedback exceeds the input bounds by {excess:.3e}: the state has \
                      left the tube around the plan"
                 ),
-                horizon: self.flight.horizon - 1,
+                horizon: before.horizon - 1,
                 rows: Vec::new(),
                 relaxations: Vec::new(),
                 all_horizons_proved: false,
@@ -393,21 +384,39 @@ impl Context<'_> {
         }
         let verified = Verified { trajectory: ahead(&whole.trajectory, since), ..whole };
         let flight = Flight {
-            previous_state: self.measured.clone(),
+            previous_state: measured.clone(),
             previous_input: input,
             horizon: verified.trajectory.horizon(),
-            ..self.flight.clone()
+            ..before.clone()
         };
-        let diagnostics =
-            diagnostics(artifact, Branch::TubeFeedback, Some(&flight), Work::default());
-        let disturbance = Some(self.disturbance);
-        Ok(commanded(artifact, self.step, flight, verified, disturbance, diagnostics))
+        let diagnostics = self.diagnostics(Branch::TubeFeedback, &flight, Work::default());
+        Ok(self.commanded(flight, verified, diagnostics))
     }
 
+    fn diagnostics(self, branch: Branch, flight: &Flight, work: Work) -> Diagnostics {
+        let missed_steps = self.behind.missed;
+        let artifact = self.present.artifact;
+        Diagnostics { missed_steps, ..diagnostics(artifact, branch, Some(flight), work) }
+    }
+
+    fn commanded(self, flight: Flight, verified: Verified, diagnostics: Diagnostics) -> Step {
+        let Present { artifact, step, .. } = *self.present;
+        let disturbance = Some(self.behind.disturbance.clone());
+        commanded(artifact, step, flight, verified, disturbance, diagnostics)
+    }
+
+    /// Hands on the state that was given: the next measurement finds one more step missed.
     fn infeasible(self, infeasible: Infeasibility, work: Work) -> Step {
-        let state = State { step: self.step, flight: Some(self.flight.clone()) };
-        let disturbance = Some(self.disturbance);
-        infeasible_step(self.artifact, &state, infeasible, disturbance, work)
+        Step {
+            index: self.present.step,
+            verdict: Verdict::Infeasible(infeasible),
+            next: self.present.given.clone(),
+            trajectory: None,
+            certificate: None,
+            evidence: None,
+            disturbance: Some(self.behind.disturbance.clone()),
+            diagnostics: self.diagnostics(Branch::None, &self.behind.flight, work),
+        }
     }
 }
 
@@ -477,7 +486,7 @@ pub(super) fn ahead(plan: &Trajectory, since: usize) -> Trajectory {
     }
 }
 
-fn nominal_states(artifact: &Artifact, initial: &[f64], inputs: &[f64]) -> Vec<f64> {
+pub(super) fn nominal_states(artifact: &Artifact, initial: &[f64], inputs: &[f64]) -> Vec<f64> {
     let horizon = inputs.len() / artifact.tables.inputs();
     let mut states = vec![0.0; (horizon + 1) * initial.len()];
     states[..initial.len()].copy_from_slice(initial);
@@ -533,25 +542,6 @@ pub(super) fn command(
     }
 }
 
-fn infeasible_step(
-    artifact: &Artifact,
-    state: &State,
-    infeasible: Infeasibility,
-    disturbance: Option<RealisedDisturbance>,
-    work: Work,
-) -> Step {
-    Step {
-        index: state.step,
-        verdict: Verdict::Infeasible(infeasible),
-        next: state.clone(),
-        trajectory: None,
-        certificate: None,
-        evidence: None,
-        disturbance,
-        diagnostics: diagnostics(artifact, Branch::None, state.flight.as_ref(), work),
-    }
-}
-
 /// What the solvers did for one answer.
 #[derive(Default)]
 struct Work {
@@ -598,18 +588,13 @@ fn diagnostics(
         simplex_pivots: work.simplex_pivots,
         general_solver_calls: work.general_solver_calls,
         lambda: artifact.decrease.lambda_bar,
+        missed_steps: 0,
     }
 }
 
 /// The step after the last command.
-fn arrive(
-    artifact: &Artifact,
-    state: &State,
-    flight: &Flight,
-    measured: &DVector<f64>,
-    disturbance: RealisedDisturbance,
-) -> Step {
-    let step = state.step;
+fn arrive(present: &Present<'_>, behind: &Behind<'_>) -> Step {
+    let Present { artifact, step, ref measured, .. } = *present;
     let zero = DVector::zeros(measured.len());
     let reference = artifact.model.reference(step).unwrap_or(&zero);
     let deviation = measured - reference;
@@ -619,17 +604,18 @@ fn arrive(
         completion_steps: step,
         distance_m: distance,
         deviation_norm: deviation.norm(),
-        inside_guaranteed_set: inside_final_set(artifact, flight, measured),
+        inside_guaranteed_set: inside_final_set(artifact, &behind.flight, measured),
     };
+    let diagnostics = diagnostics(artifact, Branch::None, Some(&behind.flight), Work::default());
     Step {
         index: step,
         verdict: Verdict::Arrived(arrival),
-        next: state.clone(),
+        next: present.given.clone(),
         trajectory: None,
         certificate: None,
         evidence: None,
-        disturbance: Some(disturbance),
-        diagnostics: diagnostics(artifact, Branch::None, Some(flight), Work::default()),
+        disturbance: Some(behind.disturbance.clone()),
+        diagnostics: Diagnostics { missed_steps: behind.missed, ..diagnostics },
     }
 }
 
@@ -650,93 +636,9 @@ fn inside_final_set(artifact: &Artifact, flight: &Flight, measured: &DVector<f64
     zonotope_gauge(set.generators(), &deviation).is_some_and(|gauge| gauge <= 1.0 + GAUGE_TOLERANCE)
 }
 
-pub(super) fn realised_disturbance(
-    artifact: &Artifact,
-    flight: &Flight,
-    measured: &DVector<f64>,
-) -> RealisedDisturbance {
-    let predicted = times_vector(&artifact.model.a, &flight.previous_state)
-        + times_vector(&artifact.model.b, &flight.previous_input);
-    let components = measured - predicted;
-    let measure = artifact.disturbance_measure.gauge(&components);
-    // The upper bound from least-norm coefficients is sharp unless the generators are dependent.
-    let gauge = match measure.gauge {
-        Some(bound) if bound > 1.0 && artifact.has_dependent_generators() => {
-            let generators = artifact.model.disturbance.generators();
-            let inside_span = artifact.disturbance_measure.inside_span(&components);
-            Some(zonotope_gauge(generators, &inside_span).unwrap_or(bound))
-        }
-        gauge => gauge,
-    };
-    let residual_max = TOLERANCE.max(GAUGE_TOLERANCE * artifact.disturbance_measure.size());
-    let outside = gauge.is_some_and(|gauge| gauge > 1.0 + GAUGE_TOLERANCE)
-        || measure.residual_norm > residual_max;
-    RealisedDisturbance {
-        components,
-        gauge,
-        residual_norm: measure.residual_norm,
-        outside_assumed_set: outside,
-    }
-}
-
-/// The measured state in scaled units, after every check.
-fn scaled_state(
-    artifact: &Artifact,
-    step: usize,
-    measurement: &Measurement,
-) -> Result<DVector<f64>, StepError> {
-    let mut faults = Vec::new();
-    if let (Some(elapsed), Some(sample_time)) = (measurement.elapsed, artifact.model.sample_time) {
-        let expected = artifact.elapsed_s(step);
-        let late = (elapsed.seconds() - expected).abs();
-        if !(late <= EPOCH_TOLERANCE * sample_time.seconds()) {
-            faults.push(Fault::new(
-                "elapsed_s",
-                format!("{expected} s, the time of step {step}"),
-                format!("{} s", elapsed.seconds()),
-            ));
-        }
-    }
-    let n = artifact.tables.states();
-    let state = match (&measurement.state, artifact.model.scaling) {
-        (MeasuredState::Relative(state), Some(scaling)) => Some(scaling.scaled(state)),
-        (MeasuredState::Linear(state), None) if state.len() == n => Some(state.clone()),
-        (MeasuredState::Linear(state), None) => {
-            let got = format!("{} values", state.len());
-            faults.push(Fault::new("linear.components", format!("{n} values"), got));
-            None
-        }
-        (MeasuredState::Linear(_), Some(_)) => {
-            faults.push(Fault::new(
-                "linear",
-                "a relative state: the plant is a spacecraft",
-                "a linear state",
-            ));
-            None
-        }
-        (MeasuredState::Relative(_), None) => {
-            faults.push(Fault::new(
-                "relative",
-                "a linear state: the plant is a general one",
-                "a relative state",
-            ));
-            None
-        }
-    };
-    if let Some(state) = &state
-        && !state.iter().all(|x| x.is_finite())
-    {
-        faults.push(Fault::new("", "finite numbers", "a number that is not finite when scaled"));
-    }
-    match state {
-        Some(state) if faults.is_empty() => Ok(state),
-        _ => Err(StepError::Measurement(faults)),
-    }
-}
-
 impl Artifact {
     /// Time of step `step` since the mission's start; 0 for a plant without a sample time.
-    fn elapsed_s(&self, step: usize) -> f64 {
+    pub(super) fn elapsed_s(&self, step: usize) -> f64 {
         self.model.sample_time.map_or(0.0, |time| super::stages::as_f64(step) * time.seconds())
     }
 }

@@ -6,6 +6,7 @@ use super::{
     Artifact, Branch, Evidence, Measurement, Scheme, State, Step, TerminalFallback, Trajectory,
     Verdict,
     certify::{self, Statement, TOLERANCE},
+    present::{Behind, Present},
     stages::{Stages, Terminal},
     state::Flight,
     step,
@@ -34,26 +35,17 @@ pub fn verify_step(
     measurement: &Measurement,
     answer: &Step,
 ) -> Result<Option<Certificate>, StepError> {
-    let measured = step::measured_state(artifact, before, measurement)?;
+    let present = Present::new(artifact, before, measurement)?;
     if !matches!(answer.verdict, Verdict::Command(_)) {
         return Ok(None);
     }
-    let present = Present { artifact, step: before.step, flight: before.flight.as_ref(), measured };
-    let certificate = match present.flight {
-        Some(flight) if artifact.problem.scheme == Scheme::TubeOptimalControl => {
-            present.around_plan(flight, answer)
+    let certificate = match &present.behind {
+        Some(behind) if artifact.problem.scheme == Scheme::TubeOptimalControl => {
+            present.around_plan(&behind.flight, answer)
         }
         _ => present.planned_now(answer),
     };
     Ok(Some(certificate.unwrap_or_else(|| certify::refused(claim(answer)))))
-}
-
-/// What an answer is judged against.
-struct Present<'a> {
-    artifact: &'a Artifact,
-    step: usize,
-    flight: Option<&'a Flight>,
-    measured: DVector<f64>,
 }
 
 /// The terminal constraint that a problem prescribes, and how an answer describes it.
@@ -136,7 +128,7 @@ impl Present<'_> {
             let centre = terminal.centre.clone();
             Some(Prescribed { terminal, powers: Vec::new(), centre })
         };
-        match (answer.diagnostics.branch, self.flight) {
+        match (answer.diagnostics.branch, &self.behind) {
             (Branch::TerminalPoint, _) if artifact.problem.scheme != Scheme::FixedTerminal => {
                 own(stages)
             }
@@ -144,7 +136,7 @@ impl Present<'_> {
                 own(stages)
             }
             (Branch::TubeFeedback, None) => own(stages),
-            (Branch::TerminalSet, Some(flight)) if artifact.is_adaptive() => {
+            (Branch::TerminalSet, Some(Behind { flight, .. })) if artifact.is_adaptive() => {
                 let left = flight.horizon - 1;
                 let mut powers = flight.powers.clone();
                 powers.push(left);
@@ -161,8 +153,7 @@ impl Present<'_> {
                 let terminal = stages.grown_terminal(centre.clone(), &powers, constrain_last);
                 Some(Prescribed { terminal, powers, centre })
             }
-            (Branch::PreviousPlanTail, Some(flight)) => {
-                let disturbance = step::realised_disturbance(artifact, flight, &self.measured);
+            (Branch::PreviousPlanTail, Some(Behind { flight, disturbance, .. })) => {
                 let tail = step::PlanTail::new(artifact, flight, &disturbance.components);
                 let mut powers = flight.powers.clone();
                 if artifact.is_adaptive() {
@@ -193,6 +184,8 @@ impl Present<'_> {
         let stated = &answer.diagnostics;
         *given == command
             && answer.index == self.step
+            && stated.missed_steps == self.behind.as_ref().map_or(0, |behind| behind.missed)
+            && answer.disturbance == self.behind.as_ref().map(|behind| behind.disturbance.clone())
             && stated.horizon == horizon
             && answer.next.step == self.step + 1
             && next.horizon == horizon
