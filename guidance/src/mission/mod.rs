@@ -6,4 +6,6 @@ mod uncertainty;
 
 pub use docking_cone::{CONE_FACES, ConeFaces, DockingCone};
 pub use target::{BodyMotion, RateReference, TargetMotion, TargetSample};
-pub use uncertainty::DisturbanceSet;
+pub use uncertainty::{
+    ActuationAndNavigation, CovarianceFault, DisturbanceSet, NavigationCovariance,
+};

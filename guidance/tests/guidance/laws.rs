@@ -1,6 +1,6 @@
 //! Laws of the closed loop on random missions, and what a certificate refuses.
 
-use nalgebra::{DMatrix, DVector, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix6, Vector3, Vector6};
 use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -15,7 +15,10 @@ use vbar_guidance::{
         },
     },
     dynamics::HillScaling,
-    mission::{BodyMotion, DisturbanceSet, DockingCone, TargetMotion},
+    mission::{
+        ActuationAndNavigation, BodyMotion, DisturbanceSet, DockingCone, NavigationCovariance,
+        TargetMotion,
+    },
     program::{Clarabel, DualSimplex},
     units::{Acceleration, Angle, Seconds},
 };
@@ -409,7 +412,8 @@ fn fly_with_gaps(mission: &Mission) -> Result<Gaps, TestCaseError> {
             prop_assert!(!w.outside_assumed_set, "step {}: {:?}", k, w);
             prop_assert_eq!(w.steps, missed + 1);
             // Both are differences of the same states; scaled states are of order 1 to 10.
-            prop_assert!((&w.components - (&x - &predicted)).amax() < 1e-13, "step {}: {:?}", k, w);
+            let difference = (&w.components - (&x - &predicted)).amax();
+            prop_assert!(difference < 1e-13, "step {}: {} {:?}", k, difference, w);
             in_tube = !w.outside_guaranteed_tube;
             if missed > 0 {
                 *(if in_tube { &mut gaps.inside_tube } else { &mut gaps.outside_tube }) += 1;
@@ -523,6 +527,47 @@ fn missed_steps_end_with_the_plan() {
         assert_eq!(at(horizon + 1), Err(exhausted));
         assert!(matches!(at(4_000_000_000), Err(StepError::PlanExhausted { .. })));
     }
+}
+
+/// Also a singular covariance: its factor is made again on reading, bit by bit.
+#[test]
+fn artifact_with_navigation_errors_survives_its_bytes_and_flies() {
+    let mission = example(Scheme::AdaptiveTerminal, DisturbanceLaw::Uniform);
+    let mut problem = mission.problem();
+    let Plant::Hill(plant) = &mut problem.plant else { unreachable!("a spacecraft") };
+    // 1 cm and 0.1 mm/s, radial position and along-track velocity fully correlated.
+    let deviations = [0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4];
+    let mut covariance = Matrix6::from_diagonal(&Vector6::from(deviations.map(|d| d * d)));
+    covariance[(0, 4)] = -deviations[0] * deviations[4];
+    covariance[(4, 0)] = covariance[(0, 4)];
+    plant.disturbance = DisturbanceSet::ActuationAndNavigation(ActuationAndNavigation {
+        navigation: Some(Box::new(NavigationCovariance::new(covariance, 3.0).unwrap())),
+        thrust_magnitude_error: 0.005,
+        pointing_error_max: Angle::from_degrees(0.2),
+    });
+    problem.weights.fuel = 1.0;
+    let artifact = Artifact::prepare(&problem).unwrap();
+    let back = Artifact::from_bytes(&artifact.to_bytes()).unwrap();
+    assert_eq!(back, artifact);
+    let summary = artifact.summary();
+    assert_eq!(summary.disturbance_generators.ncols(), 6 + 6 + 3);
+    assert!(summary.lambda_bar > 0.0, "{}", summary.lambda_bar);
+    let mut random = ChaCha8Rng::seed_from_u64(11);
+    let (mut x, mut state) = (mission.start(), VariableHorizon::start(&artifact));
+    for _ in 0..300 {
+        let answer = step(&mission, &artifact, &state, &x);
+        match answer.verdict {
+            Verdict::Arrived(arrival) => return assert!(arrival.inside_guaranteed_set),
+            Verdict::Infeasible(why) => panic!("{why:?}"),
+            Verdict::Command(command) => {
+                // Fifteen generators of six dimensions: the exact gauge is asked.
+                assert!(answer.disturbance.is_none_or(|w| !w.outside_assumed_set));
+                x = flown(&artifact, &x, &command.input, mission.law, &mut random);
+            }
+        }
+        state = answer.next;
+    }
+    panic!("no arrival");
 }
 
 fn example(scheme: Scheme, law: DisturbanceLaw) -> Mission {

@@ -1,11 +1,16 @@
 //! Variable horizon: `vbar/v1/variable_horizon.proto` and
 //! `vbar_guidance::control::variable_horizon`.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{
+    DMatrix, DVector, Matrix3, Matrix6, Quaternion, Rotation3, UnitQuaternion, Vector3,
+};
 use vbar_guidance::{
     control::variable_horizon::{self as method, Branch, Plan, Step, TrialOutcome, Verdict},
     dynamics::HillScaling,
-    mission::{BodyMotion, DisturbanceSet, DockingCone, RateReference, TargetMotion, TargetSample},
+    mission::{
+        ActuationAndNavigation, BodyMotion, DisturbanceSet, DockingCone, NavigationCovariance,
+        RateReference, TargetMotion, TargetSample,
+    },
     sets::Zonotope,
     units::{Acceleration, Angle, Mass, Seconds},
 };
@@ -560,7 +565,7 @@ fn hill_disturbance(
     match &message.form {
         None => door.refuse(
             path,
-            "one of none, box, box_si, generators_nd, misalignment",
+            "one of none, box, box_si, generators_nd, misalignment, actuation_and_navigation",
             "nothing (write none for W = {0})",
         ),
         Some(Form::None(v1::NoDisturbance {})) => Some(DisturbanceSet::None),
@@ -610,7 +615,80 @@ fn hill_disturbance(
             let angle = number(angle, |d| (0.0..90.0).contains(&d), expected, place, door)?;
             Some(DisturbanceSet::Misalignment(Angle::from_degrees(angle)))
         }
+        Some(Form::ActuationAndNavigation(given)) => {
+            actuation_and_navigation(given, axes, path.field("actuation_and_navigation"), door)
+                .map(DisturbanceSet::ActuationAndNavigation)
+        }
     }
+}
+
+fn actuation_and_navigation(
+    message: &v1::ActuationAndNavigation,
+    axes: Axes,
+    path: Path<'_>,
+    door: &mut Door,
+) -> Option<ActuationAndNavigation> {
+    if *message == v1::ActuationAndNavigation::default() {
+        let expected = "at least one of navigation, thrust_magnitude_error_fraction, \
+                        pointing_error_max_deg";
+        return door.refuse(path, expected, "nothing (write none for W = {0})");
+    }
+    let navigation = match &message.navigation {
+        None => Some(None),
+        Some(given) => navigation_covariance(given, axes, path.field("navigation"), door).map(Some),
+    };
+    let fraction = message.thrust_magnitude_error_fraction.unwrap_or(0.0);
+    let place = path.field("thrust_magnitude_error_fraction");
+    let expected = "a finite number from 0 to 1";
+    let fraction = number(fraction, |f| (0.0..=1.0).contains(&f), expected, place, door);
+    let angle = message.pointing_error_max_deg.unwrap_or(0.0);
+    let place = path.field("pointing_error_max_deg");
+    let expected = "a finite number from 0 to less than 90";
+    let angle = number(angle, |d| (0.0..90.0).contains(&d), expected, place, door);
+    Some(ActuationAndNavigation {
+        navigation: navigation?.map(Box::new),
+        thrust_magnitude_error: fraction?,
+        pointing_error_max: Angle::from_degrees(angle?),
+    })
+}
+
+fn navigation_covariance(
+    message: &v1::NavigationCovariance,
+    axes: Axes,
+    path: Path<'_>,
+    door: &mut Door,
+) -> Option<NavigationCovariance> {
+    let place = path.field("covariance");
+    let covariance = door.required(&message.covariance, place).and_then(|given| {
+        let size = Size::Exactly(HILL.0);
+        matrix(given, (size, size), place, door)
+    });
+    let level_place = path.field("sigma_level");
+    let level = door
+        .required(&message.sigma_level, level_place)
+        .and_then(|&level| positive(level, level_place, door));
+    // A covariance at fault is said whether or not the level is right; any level does for that.
+    let covariance = turned_covariance(&covariance?, axes);
+    match NavigationCovariance::new(covariance, level.unwrap_or(1.0)) {
+        Ok(navigation) => level.map(|_| navigation),
+        Err(fault) => door.refuse(place, "a symmetric positive semidefinite matrix", fault),
+    }
+}
+
+/// T P T' for the rotation T of positions and velocities to RTN.
+fn turned_covariance(covariance: &DMatrix<f64>, axes: Axes) -> Matrix6<f64> {
+    let turned = |matrix: Matrix6<f64>| {
+        let mut turned = matrix;
+        for mut column in turned.column_iter_mut() {
+            for i in [0, 3] {
+                let part = Vector3::new(column[i], column[i + 1], column[i + 2]);
+                column.fixed_rows_mut::<3>(i).copy_from(&axes.to_rtn(part));
+            }
+        }
+        turned
+    };
+    let given = Matrix6::from_fn(|i, j| covariance[(i, j)]);
+    turned(turned(given).transpose())
 }
 
 fn half_widths<'m>(
@@ -741,6 +819,9 @@ fn linear_disturbance(
         }
         Some(Form::BoxSi(_)) => door.refuse(path, EXPECTED, "box_si"),
         Some(Form::Misalignment(_)) => door.refuse(path, EXPECTED, "misalignment"),
+        Some(Form::ActuationAndNavigation(_)) => {
+            door.refuse(path, EXPECTED, "actuation_and_navigation")
+        }
     }
 }
 

@@ -207,6 +207,72 @@ async fn malformed_motion_of_the_target_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn malformed_actuation_and_navigation_is_named() {
+    let server = server().await;
+    let mut values = vec![0.0; 36];
+    (0..6).for_each(|i| values[7 * i] = if i < 3 { 0.01 } else { 1e-6 });
+    let covariance = json!({ "rows": 6, "columns": 6, "values": values });
+    let good = json!({
+        "navigation": { "covariance": covariance, "sigmaLevel": 3.0 },
+        "thrustMagnitudeErrorFraction": 0.02,
+        "pointingErrorMaxDeg": 1.0,
+    });
+    const DISTURBANCE: &str = "/variableHorizon/hill/disturbance";
+    const PATH: &str = "problem.variable_horizon.hill.disturbance.actuation_and_navigation";
+    let whole = |set: Value| {
+        let set = json!({ "actuationAndNavigation": set });
+        with(missions::envisat(), DISTURBANCE, Some(set))
+    };
+    // As it is, it is served.
+    let answer = server.post("/v1/precompute", &json!({ "problem": whole(good.clone()) })).await;
+    assert_eq!(answer.status, 200, "{}", answer.text());
+    let entries = "navigation/covariance/values";
+    let cases = [
+        // Position and velocity correlated in one triangle only.
+        (format!("{entries}/3"), Some(json!(1e-6)), ".navigation.covariance"),
+        (format!("{entries}/0"), Some(json!(-0.01)), ".navigation.covariance"),
+        (format!("{entries}/0"), Some(json!("NaN")), ".navigation.covariance.values[0]"),
+        ("navigation/covariance/rows".into(), Some(json!(5)), ".navigation.covariance.rows"),
+        ("navigation/covariance".into(), None, ".navigation.covariance"),
+        ("navigation/sigmaLevel".into(), Some(json!(0.0)), ".navigation.sigma_level"),
+        ("navigation/sigmaLevel".into(), Some(json!(-3.0)), ".navigation.sigma_level"),
+        ("navigation/sigmaLevel".into(), None, ".navigation.sigma_level"),
+        (
+            "thrustMagnitudeErrorFraction".into(),
+            Some(json!(-0.1)),
+            ".thrust_magnitude_error_fraction",
+        ),
+        (
+            "thrustMagnitudeErrorFraction".into(),
+            Some(json!(1.5)),
+            ".thrust_magnitude_error_fraction",
+        ),
+        ("pointingErrorMaxDeg".into(), Some(json!(90.0)), ".pointing_error_max_deg"),
+        ("pointingErrorMaxDeg".into(), Some(json!(-1.0)), ".pointing_error_max_deg"),
+    ];
+    for (pointer, value, field) in cases {
+        let case = format!("{pointer} = {value:?}");
+        let problem = whole(with(good.clone(), &format!("/{pointer}"), value));
+        check(&server, &case, &problem, &[&format!("{PATH}{field}")]).await;
+    }
+    check(&server, "nothing at all", &whole(json!({})), &[PATH]).await;
+    // An indefinite matrix: correlation 1.1. Both it and the level are said.
+    let mut indefinite = values.clone();
+    indefinite[1] = 0.011;
+    indefinite[6] = 0.011;
+    let covariance = json!({ "rows": 6, "columns": 6, "values": indefinite });
+    let both = json!({ "navigation": { "covariance": covariance, "sigmaLevel": 0.0 } });
+    let fields =
+        [format!("{PATH}.navigation.sigma_level"), format!("{PATH}.navigation.covariance")];
+    check(&server, "both wrong", &whole(both), &[&fields[0], &fields[1]]).await;
+    let set = json!({ "actuationAndNavigation": { "pointingErrorMaxDeg": 1.0 } });
+    let linear = "/variableHorizon/linear/disturbance";
+    let problem = with(missions::double_integrator(), linear, Some(set));
+    let field = "problem.variable_horizon.linear.disturbance";
+    check(&server, "not a spacecraft", &problem, &[field]).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn malformed_gain_that_does_not_stabilise_is_named() {
     let server = server().await;
     let gain = json!({ "explicit": { "rows": 1, "columns": 2, "values": [1.0, 1.0] } });

@@ -235,8 +235,8 @@ impl DisturbanceLaw {
             faults.push(format!("{place}: additive laws need the linear truth"));
         }
         let samples_w = matches!(self, Self::Uniform | Self::Vertices | Self::ConstantVertex);
-        if samples_w && matches!(model.disturbance, DisturbanceModel::Misalignment) {
-            faults.push(format!("{place}: W is made from misalignment; use a misalignment law"));
+        if samples_w && matches!(model.disturbance, DisturbanceModel::FromErrors) {
+            faults.push(format!("{place}: W is made from errors; use a misalignment law"));
         }
         match self {
             Self::Constant { components_nd } => {
@@ -324,7 +324,7 @@ fn sign(chance: &mut impl Rng) -> f64 {
 
 fn sample(set: &DisturbanceModel, states: usize, factor: &mut dyn FnMut() -> f64) -> DVector<f64> {
     match set {
-        DisturbanceModel::None | DisturbanceModel::Misalignment => DVector::zeros(states),
+        DisturbanceModel::None | DisturbanceModel::FromErrors => DVector::zeros(states),
         DisturbanceModel::Box(half_widths) => half_widths.map(|half_width| half_width * factor()),
         DisturbanceModel::Zonotope(generators) => {
             generators * DVector::from_fn(generators.ncols(), |_, _| factor())

@@ -116,8 +116,8 @@ pub(crate) enum DisturbanceModel {
     Box(DVector<f64>),
     /// Generators, one a column, scaled.
     Zonotope(DMatrix<f64>),
-    /// Made from thrust misalignment: no law of its own in state space.
-    Misalignment,
+    /// Made from errors of thrusters and navigation: no law of its own in state space.
+    FromErrors,
 }
 
 impl Model {
@@ -445,7 +445,9 @@ fn disturbance_model(
             }
             Some(DisturbanceModel::Zonotope(generators))
         }
-        Some(Form::Misalignment(_)) => Some(DisturbanceModel::Misalignment),
+        Some(Form::Misalignment(_) | Form::ActuationAndNavigation(_)) => {
+            Some(DisturbanceModel::FromErrors)
+        }
     }
 }
 

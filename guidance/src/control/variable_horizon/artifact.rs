@@ -329,7 +329,7 @@ impl Model {
             Corridor::Cone(faces.collect())
         });
         Self {
-            disturbance: plant.disturbance.zonotope(&scaling, &b),
+            disturbance: plant.disturbance.zonotope(&scaling, &a, &b),
             a,
             b,
             sample_time: Some(Seconds::from_seconds(sample_time_s)),

@@ -1,6 +1,6 @@
 //! Canonical bytes of a problem: equal problems, equal bytes; also how artifacts keep them.
 
-use nalgebra::{Quaternion, UnitQuaternion};
+use nalgebra::{Matrix6, Quaternion, UnitQuaternion};
 
 use super::{
     GainChoice, HillPlant, HorizonSearch, LinearPlant, Plant, Problem, Scheme, TerminalFallback,
@@ -8,7 +8,10 @@ use super::{
 };
 use crate::{
     bytes::{DecodeError, Reader, Writer},
-    mission::{BodyMotion, DisturbanceSet, DockingCone, RateReference, TargetMotion, TargetSample},
+    mission::{
+        ActuationAndNavigation, BodyMotion, DisturbanceSet, DockingCone, NavigationCovariance,
+        RateReference, TargetMotion, TargetSample,
+    },
     sets::{Polytope, Zonotope},
     units::{Acceleration, Angle, Mass, Seconds},
 };
@@ -176,6 +179,15 @@ fn write_hill(writer: &mut Writer, plant: &HillPlant) {
             writer.tag(5);
             writer.number(angle.radians());
         }
+        DisturbanceSet::ActuationAndNavigation(errors) => {
+            writer.tag(6);
+            writer.option(errors.navigation.as_deref(), |writer, navigation| {
+                navigation.covariance().iter().for_each(|&entry| writer.number(entry));
+                writer.number(navigation.sigma_level());
+            });
+            writer.number(errors.thrust_magnitude_error);
+            writer.number(errors.pointing_error_max.radians());
+        }
     }
 }
 
@@ -217,6 +229,11 @@ fn read_hill(reader: &mut Reader<'_>) -> Result<HillPlant, DecodeError> {
         }
         4 => DisturbanceSet::Generators(reader.matrix()?),
         5 => DisturbanceSet::Misalignment(Angle::from_radians(reader.number()?)),
+        6 => DisturbanceSet::ActuationAndNavigation(ActuationAndNavigation {
+            navigation: reader.option(read_covariance)?.map(Box::new),
+            thrust_magnitude_error: reader.number()?,
+            pointing_error_max: Angle::from_radians(reader.number()?),
+        }),
         other => return Err(unknown(reader, "disturbance set", other)),
     };
     Ok(HillPlant {
@@ -228,6 +245,16 @@ fn read_hill(reader: &mut Reader<'_>) -> Result<HillPlant, DecodeError> {
         target,
         disturbance,
     })
+}
+
+fn read_covariance(reader: &mut Reader<'_>) -> Result<NavigationCovariance, DecodeError> {
+    let mut covariance = Matrix6::zeros();
+    for entry in covariance.iter_mut() {
+        *entry = reader.number()?;
+    }
+    let sigma_level = reader.number()?;
+    NavigationCovariance::new(covariance, sigma_level)
+        .map_err(|fault| reader.fault(fault.to_string()))
 }
 
 fn write_body(writer: &mut Writer, body: &BodyMotion) {
