@@ -12,29 +12,23 @@ use vbar_client::{
     Client, Options,
     v1::{ComputePlanRequest, Measurement, StepRequest},
 };
-use vbar_simulator::{Mission, SchemeChoice};
 
 use crate::{
     failure::Failure,
     json,
+    mission::MissionArguments,
     session::{NodeArguments, Session},
 };
 
 /// Largest request that is read.
 const REQUEST_BYTES_MAX: u64 = 64 << 20;
 
-/// The plan starts at the mission's own first state, or at the one given.
+/// The plan starts at the mission's own first state, or at the one given. The scheme
+/// tube-optimal-control gives plan and feedback, any other its open-loop plan.
 #[derive(Debug, Args)]
 pub(crate) struct PlanArguments {
-    /// Mission file, such as simulator/missions/envisat.json
-    #[arg(value_name = "MISSION")]
-    mission: PathBuf,
     #[command(flatten)]
-    node: NodeArguments,
-    /// Controller instead of the mission's own; tube-optimal-control gives plan and feedback, any
-    /// other its open-loop plan
-    #[arg(long, value_name = "SCHEME")]
-    scheme: Option<SchemeChoice>,
+    mission: MissionArguments,
     /// File with a Measurement as JSON to start from; - is standard input. Needed where the
     /// mission draws its first state by chance
     #[arg(long, value_name = "FILE")]
@@ -54,14 +48,8 @@ pub(crate) struct StepArguments {
 /// Give a running node with --server: what a node of our own makes is gone when the command ends.
 #[derive(Debug, Args)]
 pub(crate) struct PrecomputeArguments {
-    /// Mission file, such as simulator/missions/envisat.json
-    #[arg(value_name = "MISSION")]
-    mission: PathBuf,
     #[command(flatten)]
-    node: NodeArguments,
-    /// Controller instead of the mission's own
-    #[arg(long, value_name = "SCHEME")]
-    scheme: Option<SchemeChoice>,
+    mission: MissionArguments,
 }
 
 /// Made for the health check of a container.
@@ -76,7 +64,7 @@ pub(crate) struct HealthArguments {
 }
 
 pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
-    let mission = load(&arguments.mission, arguments.scheme)?;
+    let mission = arguments.mission.load_for_one_scheme()?;
     let initial: Measurement = match &arguments.initial {
         Some(path) => json::parse(&read(path)?)?,
         None => mission.fixed_start().ok_or_else(|| {
@@ -88,7 +76,7 @@ pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
         initial: Some(initial),
         validate_only: false,
     };
-    let session = Session::open(&arguments.node).await?;
+    let session = Session::open(&arguments.mission.node).await?;
     let answer = session.client.plan(request).await;
     session.close().await;
     json::print(&json::render(&answer?)?)
@@ -103,8 +91,8 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
 }
 
 pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
-    let mission = load(&arguments.mission, arguments.scheme)?;
-    let session = Session::open(&arguments.node).await?;
+    let mission = arguments.mission.load_for_one_scheme()?;
+    let session = Session::open(&arguments.mission.node).await?;
     let answer = session.client.precompute(mission.problem).await;
     session.close().await;
     json::print(&json::render(&answer?)?)
@@ -118,15 +106,6 @@ pub(crate) async fn health(arguments: HealthArguments) -> Result<(), Failure> {
         json::print("serving")
     } else {
         Err(Failure::unavailable(format!("{} is not serving", arguments.server)))
-    }
-}
-
-fn load(path: &Path, scheme: Option<SchemeChoice>) -> Result<Mission, Failure> {
-    let mission = Mission::load(path).map_err(|fault| Failure::data(fault.to_string()))?;
-    match scheme {
-        None => Ok(mission),
-        Some(SchemeChoice::All) => Err(Failure::usage("--scheme: name one")),
-        Some(SchemeChoice::One(scheme)) => Ok(mission.with_scheme(scheme)),
     }
 }
 

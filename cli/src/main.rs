@@ -8,6 +8,7 @@ mod calls;
 mod failure;
 mod json;
 mod log;
+mod mission;
 mod serve;
 mod session;
 mod simulate;

@@ -7,27 +7,16 @@ use std::{
 
 use clap::{Args, ValueEnum};
 use vbar_client::v1::HorizonSearch;
-use vbar_simulator::{Mission, ProgressBar, Report, RunOptions, SchemeChoice, draw};
+use vbar_simulator::{Mission, ProgressBar, Report, RunOptions, draw};
 
-use crate::{
-    failure::Failure,
-    json,
-    session::{NodeArguments, Session},
-};
+use crate::{failure::Failure, json, mission::MissionArguments, session::Session};
 
 /// The report goes to standard output; pictures and traces go to a folder, whose files are named
 /// on standard error.
 #[derive(Debug, Args)]
 pub(crate) struct SimulateArguments {
-    /// Mission file, such as simulator/missions/envisat.json
-    #[arg(value_name = "MISSION")]
-    mission: PathBuf,
     #[command(flatten)]
-    node: NodeArguments,
-    /// Controller instead of the mission's own: adaptive-terminal, fixed-terminal,
-    /// tube-optimal-control, nominal, or all that the mission compares
-    #[arg(long, value_name = "SCHEME")]
-    scheme: Option<SchemeChoice>,
+    mission: MissionArguments,
     /// How the horizon is searched instead of the mission's own way
     #[arg(long, value_name = "SEARCH")]
     search: Option<Search>,
@@ -88,10 +77,9 @@ enum Format {
 
 /// Flies a mission and reports.
 pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure> {
-    let mission =
-        Mission::load(&arguments.mission).map_err(|fault| Failure::data(fault.to_string()))?;
+    let mission = arguments.mission.load()?;
     let options = options(&arguments)?;
-    let session = Session::open(&arguments.node).await?;
+    let session = Session::open(&arguments.mission.node).await?;
     let progress = ProgressBar::default();
     let flown = vbar_simulator::simulate(&session.client, &mission, &options, &progress).await;
     session.close().await;
@@ -117,7 +105,7 @@ fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
         }
     };
     Ok(RunOptions {
-        scheme: arguments.scheme,
+        scheme: arguments.mission.scheme,
         search: arguments.search.map(|search| match search {
             Search::Local => HorizonSearch::Local,
             Search::Enumeration => HorizonSearch::Enumeration,

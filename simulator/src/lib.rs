@@ -27,7 +27,7 @@ pub use report::{Report, Statistics, Summary};
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::DVector;
+    use nalgebra::{DVector, Vector3};
 
     /// The cases of one file of reference numbers (see `tests/golden/variable_horizon`).
     pub(crate) fn golden_cases(file: &str) -> Vec<serde_json::Value> {
@@ -35,6 +35,21 @@ mod tests {
         let path = format!("{folder}/{file}");
         let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
         serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
+    }
+
+    /// Every reference case of a spacecraft near a target with a constant spin.
+    pub(crate) fn spinning_cases() -> impl Iterator<Item = serde_json::Value> {
+        let files =
+            ["adversarial.json", "envisat_p0.json", "mc000_p0.json", "tumbling_sat_003.json"];
+        files.into_iter().flat_map(golden_cases).filter(|case| {
+            let physical = &case["physical"];
+            physical["dt_s"].is_number() && physical["omega_rad_s"].is_array()
+        })
+    }
+
+    /// A list of three numbers.
+    pub(crate) fn vector3(json: &serde_json::Value) -> Vector3<f64> {
+        Vector3::from_column_slice(vector(json).as_slice())
     }
 
     /// A list of numbers.

@@ -14,8 +14,9 @@ pub const CONE_FACES: usize = 4;
 pub struct DockingCone {
     /// Half angle alpha of the circular cone, in (0, pi/2).
     pub half_angle: Angle,
-    /// Roll of the faces about the axis, from the paper's orientation (7). The paper leaves it
-    /// open, but it changes the optimum, so it belongs to the problem.
+    /// Roll of the faces about the axis, from the paper's orientation (7), right-handed about the
+    /// port's direction. The paper leaves it open, but it changes the optimum, so it belongs to
+    /// the problem.
     pub face_roll: Angle,
 }
 
@@ -147,6 +148,21 @@ mod tests {
                 assert!((angle - Angle::from_degrees(25.0).radians()).abs() < 1e-12);
             }
         }
+    }
+
+    #[test]
+    fn roll_is_right_handed_about_the_port() {
+        // The first normal's part across the axis turns with the roll.
+        let port = Vector3::new(0.7, -1.1, 0.4);
+        let axis = port.normalize();
+        let across = |roll| {
+            let normal = cone(roll).faces(port).normals[0];
+            (normal - axis * axis.dot(&normal)).normalize()
+        };
+        let turned = axis.cross(&across(0.0));
+        assert!((across(90.0) - turned).norm() < 1e-14);
+        let quarter = (across(0.0) + turned) / std::f64::consts::SQRT_2;
+        assert!((across(45.0) - quarter).norm() < 1e-14);
     }
 
     #[test]

@@ -6,14 +6,16 @@ mod grpc;
 mod http;
 
 use std::{
-    sync::Arc,
+    collections::BTreeMap,
+    sync::{Arc, LazyLock},
     time::{Duration, Instant},
 };
 
-use ::http::{HeaderMap, HeaderValue, Request, Response, header};
+use ::http::{HeaderMap, HeaderValue, Method, Request, Response, header};
 use axum::{Router, body::Body};
 use tower::ServiceExt as _;
 use tracing::Instrument as _;
+use vbar_proto::DESCRIPTORS;
 
 use crate::{
     service::{Error, Service},
@@ -64,7 +66,7 @@ impl Front {
         let start = Instant::now();
         let id = RequestId::from_caller(request.headers().get(REQUEST_ID));
         let transport = if is_grpc(request.headers()) { "grpc" } else { "http" };
-        let method = known_method(request.uri().path());
+        let method = known_method(request.method(), request.uri().path());
         request.extensions_mut().insert(id.clone());
         let span = tracing::info_span!("request", %id, transport, method);
         let answered = self.router.clone().oneshot(request).instrument(span.clone()).await;
@@ -111,22 +113,28 @@ fn is_grpc(headers: &HeaderMap) -> bool {
         .is_some_and(|value| value.as_bytes().starts_with(b"application/grpc"))
 }
 
-/// A label must come from a fixed list, or strangers could fill the memory with labels.
-fn known_method(path: &str) -> &'static str {
-    match path {
-        "/vbar.v1.GuidanceService/ComputePlan" | "/v1/plans:compute" => "ComputePlan",
-        "/vbar.v1.GuidanceService/Precompute" | "/v1/precompute" => "Precompute",
-        "/vbar.v1.GuidanceService/GetArtifact" => "GetArtifact",
-        "/vbar.v1.GuidanceService/Step" | "/v1/step" => "Step",
-        "/vbar.v1.GuidanceService/StepStream" => "StepStream",
-        "/vbar.v1.GuidanceService/GetServerInfo" | "/v1/info" => "GetServerInfo",
-        "/healthz" | "/readyz" | "/metrics" | "/openapi.json" => "probe",
-        _ if path.starts_with("/v1/artifacts/") => "GetArtifact",
-        _ if path.starts_with("/google.longrunning.") => "Operations",
-        _ if path.starts_with("/v1/operations") => "Operations",
-        _ if path.starts_with("/grpc.health.") => "Health",
-        _ if path.starts_with("/grpc.reflection.") => "Reflection",
-        _ => "unknown",
+/// Name of every RPC of the contract, by its gRPC path.
+static RPCS: LazyLock<BTreeMap<String, String>> = LazyLock::new(|| {
+    let methods = DESCRIPTORS.services().flat_map(|service| service.methods().collect::<Vec<_>>());
+    methods
+        .map(|rpc| {
+            let path = format!("/{}/{}", rpc.parent_service().full_name(), rpc.name());
+            (path, rpc.name().to_owned())
+        })
+        .collect()
+});
+
+/// A label must come from a fixed list, or strangers could fill the memory with labels: an RPC of
+/// the contract, whatever it came over, or what else the port serves.
+fn known_method(method: &Method, path: &str) -> &'static str {
+    if let Some(rpc) = RPCS.get(path) {
+        return rpc;
+    }
+    match http::served(method, path) {
+        Some(name) => name,
+        None if path.starts_with("/grpc.health.") => "Health",
+        None if path.starts_with("/grpc.reflection.") => "Reflection",
+        None => "unknown",
     }
 }
 
@@ -174,4 +182,36 @@ fn server_timing(compute: Duration) -> HeaderValue {
 /// Reads a caller's deadline.
 fn deadline_fault(header: &str, expected: &str, got: &HeaderValue) -> Error {
     Error::field(header, expected, &format!("{got:?}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn known_method_is_the_rpc_over_both_transports() {
+        for (path, rpc) in &*RPCS {
+            assert_eq!(known_method(&Method::POST, path), rpc);
+        }
+        assert!(RPCS.contains_key("/vbar.v1.GuidanceService/StepStream"));
+        assert!(RPCS.contains_key("/google.longrunning.Operations/WaitOperation"));
+        for (method, path, label) in [
+            (Method::POST, "/v1/step", "Step"),
+            (Method::GET, "/v1/step", "Step"),
+            (Method::GET, "/v1/artifacts/00ff", "GetArtifact"),
+            (Method::GET, "/v1/operations", "ListOperations"),
+            (Method::GET, "/v1/operations/00ff", "GetOperation"),
+            (Method::HEAD, "/v1/operations/00ff", "GetOperation"),
+            (Method::DELETE, "/v1/operations/00ff", "DeleteOperation"),
+            (Method::POST, "/v1/operations/00ff:wait", "WaitOperation"),
+            (Method::POST, "/v1/operations/00ff:cancel", "CancelOperation"),
+            (Method::GET, "/healthz", "probe"),
+            (Method::POST, "/grpc.health.v1.Health/Check", "Health"),
+            (Method::GET, "/v1/artifacts/00ff/more", "unknown"),
+            (Method::GET, "/v1/stepping", "unknown"),
+            (Method::GET, "/", "unknown"),
+        ] {
+            assert_eq!(known_method(&method, path), label, "{method} {path}");
+        }
+    }
 }

@@ -68,7 +68,7 @@ fn rotation_to_radial(axis: &Vector3<f64>) -> Matrix3<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tests::{golden_cases, vector};
+    use crate::tests::{spinning_cases, vector, vector3};
 
     #[test]
     fn cone_axis_is_inside_and_faces_have_zero_margin() {
@@ -89,15 +89,10 @@ mod tests {
     #[test]
     fn cone_margin_agrees_with_reference_cases() {
         let mut checked = 0;
-        let files =
-            ["adversarial.json", "envisat_p0.json", "mc000_p0.json", "tumbling_sat_003.json"];
-        for case in files.iter().flat_map(|file| golden_cases(file)) {
+        for case in spinning_cases() {
             let physical = &case["physical"];
-            let Some(dt) = physical["dt_s"].as_f64() else { continue };
-            if !physical["omega_rad_s"].is_array() {
-                continue;
-            }
-            let three = |key: &str| Vector3::from_iterator(vector(&physical[key]).iter().copied());
+            let three = |key: &str| vector3(&physical[key]);
+            let dt = physical["dt_s"].as_f64().unwrap();
             let cone = DockingCone {
                 half_angle_rad: physical["alpha_deg"].as_f64().unwrap().to_radians(),
                 face_roll_rad: 0.0,

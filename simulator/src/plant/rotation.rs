@@ -157,7 +157,7 @@ fn orthonormal(matrix: &Matrix3<f64>) -> Matrix3<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tests::{golden_cases, vector};
+    use crate::tests::{golden_cases, spinning_cases, vector, vector3};
 
     fn target(motion: BodyMotion, point: Vector3<f64>, sample_time_s: f64) -> Target {
         Target { motion, capture_m: point, port_m: point, sample_time_s }
@@ -167,15 +167,10 @@ mod tests {
     #[test]
     fn rotation_spin_agrees_with_reference_cases() {
         let mut checked = 0;
-        let files =
-            ["adversarial.json", "envisat_p0.json", "mc000_p0.json", "tumbling_sat_003.json"];
-        for case in files.iter().flat_map(|file| golden_cases(file)) {
+        for case in spinning_cases() {
             let physical = &case["physical"];
-            let Some(dt) = physical["dt_s"].as_f64() else { continue };
-            if !physical["omega_rad_s"].is_array() {
-                continue;
-            }
-            let three = |key: &str| Vector3::from_iterator(vector(&physical[key]).iter().copied());
+            let three = |key: &str| vector3(&physical[key]);
+            let dt = physical["dt_s"].as_f64().unwrap();
             let motion = BodyMotion::Spin(three("omega_rad_s"));
             let target = target(motion, three("p_ref0_m"), dt);
             let first = case["k"].as_u64().unwrap_or(0) as usize;
@@ -204,7 +199,7 @@ mod tests {
         let case = case.expect("the torque-free case");
         let physical = &case["physical"];
         let number = |key: &str| physical[key].as_f64().expect(key);
-        let three = |key: &str| Vector3::from_iterator(vector(&physical[key]).iter().copied());
+        let three = |key: &str| vector3(&physical[key]);
         let body = TorqueFreeBody {
             inertia: three("inertia_ratio"),
             rtn_from_body: Matrix3::identity(),

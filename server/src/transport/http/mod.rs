@@ -27,6 +27,7 @@ use crate::{
 use errors::HttpError;
 
 pub(super) use errors::unknown_path;
+pub(super) use openapi::served;
 
 const JSON: HeaderValue = HeaderValue::from_static("application/json");
 const TEXT: HeaderValue = HeaderValue::from_static("text/plain; charset=utf-8");

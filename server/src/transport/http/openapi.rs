@@ -2,11 +2,14 @@
 
 use std::collections::{BTreeMap, HashMap};
 
+use http::Method;
 use prost_reflect::{
     Cardinality, EnumDescriptor, FieldDescriptor, FileDescriptor, Kind, MessageDescriptor,
 };
 use serde_json::{Map, Value, json};
 use vbar_proto::DESCRIPTORS;
+
+use super::TIMEOUT;
 
 /// One HTTP binding of an RPC.
 struct Route {
@@ -54,6 +57,41 @@ const fn bare(method: &'static str, path: &'static str, rpc: &'static str) -> Ro
     Route { method, path, rpc, body: None }
 }
 
+/// What is served beside the contract: path, what it says, in which form.
+const PROBES: [(&str, &str, &str); 4] = [
+    ("/healthz", "Whether the process is alive.", "text/plain"),
+    ("/readyz", "Whether it will answer; 503 while it shuts down.", "text/plain"),
+    ("/metrics", "Metrics for Prometheus.", "application/openmetrics-text"),
+    ("/openapi.json", "This document.", "application/json"),
+];
+
+/// Name of the RPC behind a request, `probe` for what is beside the contract; `None` if the path
+/// is not served. A method that the path does not take still belongs to the path.
+pub(in crate::transport) fn served(method: &Method, path: &str) -> Option<&'static str> {
+    if PROBES.iter().any(|(probe, ..)| *probe == path) {
+        return Some("probe");
+    }
+    let method = if method == Method::HEAD { &Method::GET } else { method };
+    let matching = ROUTES.iter().filter(|route| route.takes(path));
+    // With a verb after the id two routes match; the longer one says more.
+    let best = matching.max_by_key(|route| {
+        (route.path.len(), route.method.eq_ignore_ascii_case(method.as_str()))
+    })?;
+    best.rpc.rsplit('.').next()
+}
+
+impl Route {
+    fn takes(&self, path: &str) -> bool {
+        match self.path.split_once("{id}") {
+            None => self.path == path,
+            Some((before, after)) => path
+                .strip_prefix(before)
+                .and_then(|rest| rest.strip_suffix(after))
+                .is_some_and(|id| !id.is_empty() && !id.contains('/')),
+        }
+    }
+}
+
 /// The whole document.
 pub(super) fn document() -> Value {
     let mut schemas = Schemas::default();
@@ -62,12 +100,7 @@ pub(super) fn document() -> Value {
         let operation = operation(route, &mut schemas);
         paths.entry(route.path.to_owned()).or_default().insert(route.method.to_owned(), operation);
     }
-    for (path, summary, content) in [
-        ("/healthz", "Whether the process is alive.", "text/plain"),
-        ("/readyz", "Whether it will answer; 503 while it shuts down.", "text/plain"),
-        ("/metrics", "Metrics for Prometheus.", "application/openmetrics-text"),
-        ("/openapi.json", "This document.", "application/json"),
-    ] {
+    for (path, summary, content) in PROBES {
         paths.entry(path.to_owned()).or_default().insert("get".to_owned(), probe(summary, content));
     }
     schemas.add_status();
@@ -79,8 +112,7 @@ pub(super) fn document() -> Value {
             "description": "Guidance for spacecraft rendezvous. The messages of `vbar.v1` as \
                 canonical proto3 JSON: field names in lowerCamelCase (snake_case is accepted), \
                 64-bit integers as strings, enum values by name. Unknown fields are refused. The \
-                header `Request-Timeout-Ms` gives a deadline in milliseconds (a call that cannot keep it \
-                is answered with 504); `X-Request-Id` is echoed.",
+                header `X-Request-Id` is echoed.",
             "license": { "name": "Apache-2.0", "identifier": "Apache-2.0" },
         },
         "paths": paths,
@@ -94,6 +126,14 @@ pub(super) fn document() -> Value {
                     "description": "Artifact id: 64 lower-case hexadecimal digits.",
                     "schema": { "type": "string", "pattern": "^[0-9a-f]{64}$" },
                 },
+                "timeout": {
+                    "name": TIMEOUT,
+                    "in": "header",
+                    "required": false,
+                    "description": "Deadline in milliseconds; a call that cannot keep it is \
+                        answered with 504. Absent: the server's limit.",
+                    "schema": { "type": "integer", "minimum": 1, "maximum": 999_999_999 },
+                },
             },
         },
     })
@@ -103,7 +143,7 @@ fn operation(route: &Route, schemas: &mut Schemas) -> Value {
     let (service, rpc) = route.rpc.rsplit_once('.').unwrap_or_default();
     let service = DESCRIPTORS.get_service_by_name(service).expect("it is in the contract");
     let rpc = service.methods().find(|m| m.name() == rpc).expect("it is in the contract");
-    let mut parameters = Vec::new();
+    let mut parameters = vec![json!({ "$ref": "#/components/parameters/timeout" })];
     if route.path.contains("{id}") {
         parameters.push(json!({ "$ref": "#/components/parameters/id" }));
     }
@@ -348,6 +388,19 @@ mod tests {
         for target in found {
             let pointer = target.strip_prefix('#').expect("a local reference");
             assert!(document.pointer(pointer).is_some_and(Value::is_object), "{target}");
+        }
+    }
+
+    #[test]
+    fn openapi_every_call_declares_its_deadline() {
+        let document = document();
+        for route in &ROUTES {
+            let parameters = document["paths"][route.path][route.method]["parameters"].as_array();
+            let declared = parameters.unwrap().iter().any(|parameter| {
+                let target = parameter["$ref"].as_str().and_then(|target| target.strip_prefix('#'));
+                target.is_some_and(|target| document.pointer(target).unwrap()["name"] == TIMEOUT)
+            });
+            assert!(declared, "{} {}", route.method, route.path);
         }
     }
 
