@@ -137,7 +137,8 @@ pub struct RealisedDisturbance {
     /// The last answer's guarantee does not reach over these steps. The same as
     /// `outside_assumed_set`, unless steps were missed: then nothing held the deviation in the
     /// tube, and although W was kept it can lie outside S(m + 1). What was promised of feasibility
-    /// and decrease ends; if this answer gives a command, it promises the same anew.
+    /// and decrease ends; if this answer gives a command, it promises the same anew. Tube feedback
+    /// makes no new plan: there the promise stays lost.
     pub outside_guaranteed_tube: bool,
 }
 

@@ -41,7 +41,7 @@
 //! cost has fallen by (m + 1) lambda_bar, for the candidate v + K A_K^j e costs at most that by
 //! the same triangle inequality as for one step. If not, nothing is promised for this step: the
 //! answer says so (`outside_guaranteed_tube`), no decrease is asked of it, and the guarantee
-//! starts anew with it.
+//! starts anew with it (not for tube feedback, which makes no new plan).
 //!
 //! # Where we differ from the papers
 //! - Line 11 of Algorithm 1 gets a tolerance of 1e-9 (1 + |J|): equality is normal for W = {0}
