@@ -146,6 +146,14 @@ pub fn dual_bound(program: &HorizonProgram<'_>, multipliers: &[Multiplier]) -> D
 /// the terms that are summed, so that rounding cannot make one.
 #[must_use]
 pub fn farkas_margin(program: &HorizonProgram<'_>, ray: &[Multiplier]) -> f64 {
+    let (value, size) = farkas_contradiction(program, ray);
+    if size > 0.0 { value / size - 1e-12 } else { -1.0 }
+}
+
+/// By how much the rows of a ray contradict the input bounds, and the sum of the absolute values
+/// of the terms of that: positive is a proof of infeasibility, linear in every right side.
+#[must_use]
+pub fn farkas_contradiction(program: &HorizonProgram<'_>, ray: &[Multiplier]) -> (f64, f64) {
     let legal: Vec<Multiplier> = ray
         .iter()
         .filter(|multiplier| match multiplier.row.family {
@@ -155,8 +163,7 @@ pub fn farkas_margin(program: &HorizonProgram<'_>, ray: &[Multiplier]) -> f64 {
         })
         .copied()
         .collect();
-    let (value, size) = minimum_of_lagrangian(program, &legal, 0.0);
-    if size > 0.0 { value / size - 1e-12 } else { -1.0 }
+    minimum_of_lagrangian(program, &legal, 0.0)
 }
 
 /// min over the input bounds of cost |v|_1 + sum multiplier (left - right), and the sum of the
@@ -203,11 +210,10 @@ fn minimum_of_lagrangian(
     for generator in program.terminal_generators.chunks_exact(n) {
         add(-sum_product(generator, &terminal).abs());
     }
-    let mut carried = vec![0.0; n];
+    let (mut carried, mut slope) = (vec![0.0; n], vec![0.0; m]);
     for stage in (1..=horizon).rev() {
         let costate = &mut costates[stage * n..][..n];
         costate.iter_mut().zip(&carried).for_each(|(l, c)| *l += c);
-        let mut slope = vec![0.0; m];
         program.plant.input_gradient(costate, &mut slope);
         let entries = gradient[(stage - 1) * m..][..m].iter_mut();
         entries.zip(&slope).for_each(|(d, s)| *d += s);

@@ -46,6 +46,7 @@ mod certify;
 mod encoding;
 mod inspect;
 mod problem;
+mod relaxation;
 mod search;
 mod stages;
 mod state;
@@ -67,7 +68,7 @@ use super::{Controller, PrepareError, StepError};
 use crate::budget::Budget;
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
-pub const VERSION: &str = "1";
+pub const VERSION: &str = "2";
 
 /// The method, as a [`Controller`].
 #[derive(Debug, Clone, Copy)]
