@@ -1,6 +1,7 @@
 //! Optimisation programs: what is asked ([`HorizonProgram`]), how ([`Solver`]), what came of it
 //! ([`Solution`]), and whether it is true ([`verify`], which trusts no solver).
 
+mod anchors;
 mod clarabel;
 mod dual_simplex;
 mod gauge;
@@ -14,7 +15,8 @@ pub use gauge::zonotope_gauge;
 pub use projection::project_onto_polytope;
 pub use tables::PlantTables;
 pub use verify::{
-    DualBound, Residual, Residuals, dual_bound, farkas_margin, simulate, verify, verify_trajectory,
+    DualBound, Residual, Residuals, dual_bound, farkas_contradiction, farkas_margin, simulate,
+    verify, verify_trajectory,
 };
 
 use crate::budget::{Budget, Interruption};

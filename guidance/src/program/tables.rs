@@ -2,7 +2,9 @@
 
 use nalgebra::DMatrix;
 
-/// A, B, the products A^i B and bounds on their entries.
+use super::anchors::Anchors;
+
+/// A, B, bounds on the products A^i B, and the recursions in anchored form.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlantTables {
     n: usize,
@@ -13,10 +15,9 @@ pub struct PlantTables {
     a_rows: Vec<f64>,
     /// B column by column, n x m.
     b_columns: Vec<f64>,
-    /// A^i B row by row (n x m), i = 0 .. horizon_max - 1.
-    responses: Vec<f64>,
     /// Largest |entry| in row r of A^i B over i < j, at [j n + r], j = 0 .. horizon_max.
     reach: Vec<f64>,
+    anchors: Anchors,
 }
 
 impl PlantTables {
@@ -25,25 +26,26 @@ impl PlantTables {
     pub fn new(a: &DMatrix<f64>, b: &DMatrix<f64>, horizon_max: usize) -> Self {
         let (n, m) = (a.nrows(), b.ncols());
         let by_rows = |x: &DMatrix<f64>| -> Vec<f64> { x.transpose().as_slice().to_vec() };
-        let mut tables = Self {
+        let mut reach = vec![0.0; n];
+        let mut response = b.clone();
+        for j in 0..horizon_max {
+            for r in 0..n {
+                let largest = response.row(r).amax();
+                reach.push(f64::max(reach[j * n + r], largest));
+            }
+            response = crate::matrices::product(a, &response);
+        }
+        let size = |r: &f64| if *r > 0.0 { *r } else { 1.0 };
+        let units: Vec<f64> = reach[horizon_max * n..].iter().map(size).collect();
+        Self {
             n,
             m,
             a_columns: a.as_slice().to_vec(),
             a_rows: by_rows(a),
             b_columns: b.as_slice().to_vec(),
-            responses: Vec::with_capacity(horizon_max * n * m),
-            reach: vec![0.0; n],
-        };
-        let mut response = b.clone();
-        for j in 0..horizon_max {
-            tables.responses.extend(by_rows(&response));
-            for r in 0..n {
-                let largest = response.row(r).amax();
-                tables.reach.push(tables.reach[j * n + r].max(largest));
-            }
-            response = crate::matrices::product(a, &response);
+            reach,
+            anchors: Anchors::new(a, b, &units, horizon_max),
         }
-        tables
     }
 
     /// State components n.
@@ -61,7 +63,7 @@ impl PlantTables {
     /// Longest horizon covered.
     #[must_use]
     pub fn horizon_max(&self) -> usize {
-        self.responses.len() / (self.n * self.m)
+        self.reach.len() / self.n - 1
     }
 
     /// A (n x n) and B (n x m), each column by column: for whoever recomputes without the tables.
@@ -69,33 +71,14 @@ impl PlantTables {
         (&self.a_columns, &self.b_columns)
     }
 
-    /// Row r of A^i B.
-    pub(crate) fn response_row(&self, i: usize, r: usize) -> &[f64] {
-        &self.responses[(i * self.n + r) * self.m..][..self.m]
+    /// The recursions in anchored form, for stages up to the longest horizon.
+    pub(crate) fn anchors(&self) -> &Anchors {
+        &self.anchors
     }
 
     /// Bound on how much a unit input before stage j moves each state component at stage j.
     pub(crate) fn reach(&self, stage: usize) -> &[f64] {
         &self.reach[stage * self.n..][..self.n]
-    }
-
-    /// Coefficients of normal' z_stage on the inputs v_0 .. v_{stage-1}, into `out` (stage m
-    /// values): normal' A^(stage-1-i) B.
-    pub(crate) fn coefficients(&self, normal: &[f64], stage: usize, scale: f64, out: &mut [f64]) {
-        let out = &mut out[..stage * self.m];
-        out.fill(0.0);
-        for (r, &weight) in normal.iter().enumerate() {
-            let weight = weight * scale;
-            if weight == 0.0 {
-                continue;
-            }
-            for (i, chunk) in out.chunks_exact_mut(self.m).enumerate() {
-                let response = self.response_row(stage - 1 - i, r);
-                for (value, entry) in chunk.iter_mut().zip(response) {
-                    *value += weight * entry;
-                }
-            }
-        }
     }
 
     /// States z_0 .. z_N of inputs v_0 .. v_{N-1}, into `states` ((N + 1) n values, z_0 given).
@@ -150,15 +133,34 @@ impl PlantTables {
 
     /// out = A' costate.
     pub(crate) fn costate_back(&self, costate: &[f64], out: &mut [f64]) {
+        match self.n {
+            6 => self.costate_back_sized(6, costate, out),
+            n => self.costate_back_sized(n, costate, out),
+        }
+    }
+
+    /// Inlined where the size is a constant, so that the loops over it unroll.
+    #[inline(always)]
+    fn costate_back_sized(&self, n: usize, costate: &[f64], out: &mut [f64]) {
+        let out = &mut out[..n];
         out.fill(0.0);
-        for (row, weight) in self.a_rows.chunks_exact(self.n).zip(costate) {
-            add_scaled(out, row, *weight);
+        for (row, weight) in self.a_rows.chunks_exact(n).zip(costate) {
+            out.iter_mut().zip(row).for_each(|(value, a)| *value += weight * a);
         }
     }
 
     /// out = B' costate.
     pub(crate) fn input_gradient(&self, costate: &[f64], out: &mut [f64]) {
-        for (value, column) in out.iter_mut().zip(self.b_columns.chunks_exact(self.n)) {
+        match self.n {
+            6 => self.input_gradient_sized(6, costate, out),
+            n => self.input_gradient_sized(n, costate, out),
+        }
+    }
+
+    #[inline(always)]
+    fn input_gradient_sized(&self, n: usize, costate: &[f64], out: &mut [f64]) {
+        let costate = &costate[..n];
+        for (value, column) in out.iter_mut().zip(self.b_columns.chunks_exact(n)) {
             *value = column.iter().zip(costate).map(|(b, l)| b * l).sum();
         }
     }
@@ -168,31 +170,5 @@ impl PlantTables {
 pub(crate) fn add_scaled(target: &mut [f64], source: &[f64], weight: f64) {
     for (t, s) in target.iter_mut().zip(source) {
         *t += weight * s;
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn coefficients_agree_with_the_recursion() {
-        // Laws: the condensed row applied to the inputs equals the row applied to the state that
-        // the recursion reaches from 0. n = 3, m = 2 takes the unsized path.
-        let a = DMatrix::from_row_slice(3, 3, &[0.9, 0.2, 0.0, -0.1, 1.1, 0.3, 0.0, 0.2, 0.7]);
-        let b = DMatrix::from_row_slice(3, 2, &[1.0, 0.0, 0.5, -1.0, 0.0, 2.0]);
-        let tables = PlantTables::new(&a, &b, 5);
-        let inputs = [0.3, -0.2, 1.0, 0.5, -0.7, 0.1, 0.9, -1.0, 0.4, 0.6];
-        let mut states = vec![0.0; 18];
-        tables.roll_forward(&inputs, &mut states);
-        let normal = [0.4, -1.3, 2.0];
-        for stage in 1..=5 {
-            let mut coefficients = vec![0.0; 10];
-            tables.coefficients(&normal, stage, 1.0, &mut coefficients);
-            let condensed: f64 = coefficients.iter().zip(&inputs).map(|(c, v)| c * v).sum();
-            let z = &states[stage * 3..][..3];
-            let direct: f64 = normal.iter().zip(z).map(|(h, z)| h * z).sum();
-            assert!((condensed - direct).abs() < 1e-13, "stage {stage}: {condensed} {direct}");
-        }
     }
 }

@@ -177,6 +177,14 @@ fn has_row(program: &HorizonProgram<'_>, RowId { family, stage, index }: RowId) 
 /// the terms that are summed, so that rounding cannot make one.
 #[must_use]
 pub fn farkas_margin(program: &HorizonProgram<'_>, ray: &[Multiplier]) -> f64 {
+    let (value, size) = farkas_contradiction(program, ray);
+    if size > 0.0 { value / size - 1e-12 } else { -1.0 }
+}
+
+/// By how much the rows of a ray contradict the input bounds, and the sum of the absolute values
+/// of the terms of that: positive is a proof of infeasibility, linear in every right side.
+#[must_use]
+pub fn farkas_contradiction(program: &HorizonProgram<'_>, ray: &[Multiplier]) -> (f64, f64) {
     let legal: Vec<Multiplier> = ray
         .iter()
         .filter(|multiplier| match multiplier.row.family {
@@ -186,8 +194,7 @@ pub fn farkas_margin(program: &HorizonProgram<'_>, ray: &[Multiplier]) -> f64 {
         })
         .copied()
         .collect();
-    let (value, size) = minimum_of_lagrangian(program, &legal, 0.0);
-    if size > 0.0 { value / size - 1e-12 } else { -1.0 }
+    minimum_of_lagrangian(program, &legal, 0.0)
 }
 
 /// min over the input bounds of cost |v|_1 + sum multiplier (left - right), and the sum of the

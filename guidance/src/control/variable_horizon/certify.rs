@@ -4,17 +4,16 @@ use nalgebra::DMatrix;
 
 use super::{
     Evidence, Trajectory,
+    relaxation::least_relaxations,
     search::{Found, InfeasibleHorizon, Proof, Search},
     stages::{Stages, as_f64},
 };
 use crate::{
-    budget::Budget,
     control::{
         Certificate, Claim, ConstraintFamily, ConstraintMargin, Infeasibility, ProofRow, Relaxation,
     },
     program::{
-        DualSimplex, HorizonProgram, Residual, Residuals, RowFamily, Solver, Status, dual_bound,
-        simulate, verify_trajectory,
+        HorizonProgram, Residual, Residuals, RowFamily, dual_bound, simulate, verify_trajectory,
     },
 };
 
@@ -239,7 +238,7 @@ pub(super) fn name_infeasibility(search: &mut Search<'_, '_>, limit: usize) -> I
     if limit == 0 {
         return empty_inputs(search);
     }
-    let relaxations = relaxations(search, limit);
+    let relaxations = least_relaxations(search, limit);
     let Some(proved) = search.infeasible.clone() else {
         return Infeasibility {
             reason: "no horizon was tried".into(),
@@ -330,179 +329,4 @@ fn proof_rows(search: &Search<'_, '_>, proved: &InfeasibleHorizon) -> Vec<ProofR
     rows.truncate(QUOTED_ROWS);
     rows.retain(|row| row.weight > 1e-6);
     rows
-}
-
-/// Least relaxation of each family over three horizons, the longest among them, to five
-/// percent.
-///
-/// Bisection on the fast solver's verdict: a hundred warm feasibility programs cost less than one
-/// program of a general solver with the relaxation as a variable, which the tests compare with.
-fn relaxations(search: &mut Search<'_, '_>, limit: usize) -> Vec<Relaxation> {
-    let mut horizons = vec![limit];
-    while let Some(&last) = horizons.last().filter(|&&last| last > 1 && horizons.len() < 3) {
-        horizons.push((last / 2).max(1));
-    }
-    let families = [ConstraintFamily::State, ConstraintFamily::Input, ConstraintFamily::Terminal];
-    let mut found: Vec<Relaxation> = Vec::new();
-    for horizon in horizons {
-        let Some(terminal) = search.stages.terminal(horizon) else { continue };
-        for family in families {
-            let best = found.iter().position(|r| r.family == family);
-            let known = best.map(|i| found[i].amount);
-            let program = search.stages.program(horizon, &terminal);
-            let Some(amount) = relaxation(&program, family, known, search.budget) else { continue };
-            match best {
-                Some(i) => found[i] = Relaxation { family, horizon, amount },
-                None => found.push(Relaxation { family, horizon, amount }),
-            }
-        }
-    }
-    found
-}
-
-/// Least relaxation of one family at one horizon, if there is one below `known`.
-fn relaxation(
-    program: &HorizonProgram<'_>,
-    family: ConstraintFamily,
-    known: Option<f64>,
-    budget: Budget<'_>,
-) -> Option<f64> {
-    /// Relaxations that are looked at, scaled units: from nothing to anything.
-    const SMALLEST: f64 = 1e-9;
-    const LARGEST: f64 = 1e3;
-    const RATIO: f64 = 1.05;
-    let mut simplex = DualSimplex::default();
-    let mut basis = None;
-    let mut suffices = |amount: f64| -> Option<bool> {
-        let relaxed = Relaxed::new(program, family, amount);
-        let solution =
-            simplex.solve(&relaxed.program(program), basis.as_ref(), None, budget).ok()?;
-        basis = Some(solution.basis);
-        match solution.status {
-            Status::Optimal => Some(true),
-            Status::PrimalInfeasible => Some(false),
-            _ => None,
-        }
-    };
-    let mut enough = known.unwrap_or(LARGEST);
-    if !suffices(enough)? {
-        return None;
-    }
-    let mut too_little = SMALLEST;
-    // Geometric bisection: the answer may be micrometres or kilometres.
-    while enough > RATIO * too_little {
-        let middle = libm::sqrt(enough * too_little);
-        if suffices(middle)? {
-            enough = middle;
-        } else {
-            too_little = middle;
-        }
-    }
-    Some(enough)
-}
-
-/// A program with one family relaxed, as a mere question of feasibility.
-struct Relaxed {
-    stage_offsets: Vec<f64>,
-    input_lower: Vec<f64>,
-    input_upper: Vec<f64>,
-    input_offsets: Vec<f64>,
-    terminal_generators: Vec<f64>,
-}
-
-impl Relaxed {
-    fn new(program: &HorizonProgram<'_>, family: ConstraintFamily, amount: f64) -> Self {
-        let (n, m) = (program.states(), program.inputs());
-        let by = |wanted: ConstraintFamily| if family == wanted { amount } else { 0.0 };
-        let length = |row: &[f64]| row.iter().map(|x| x * x).sum::<f64>().sqrt();
-        let (state, input) = (by(ConstraintFamily::State), by(ConstraintFamily::Input));
-        let rows = program.constrained_stages * program.stage_rows;
-        let normals = program.stage_normals.chunks_exact(n);
-        let lengths: Vec<f64> = program.input_normals.chunks_exact(m).map(length).collect();
-        let mut terminal_generators = program.terminal_generators.to_vec();
-        if family == ConstraintFamily::Terminal {
-            for i in 0..n {
-                terminal_generators.extend((0..n).map(|j| if i == j { amount } else { 0.0 }));
-            }
-        }
-        Self {
-            stage_offsets: (program.stage_offsets[..rows].iter().zip(normals))
-                .map(|(offset, normal)| offset + state * length(normal))
-                .collect(),
-            input_lower: program.input_lower.iter().map(|lower| lower - input).collect(),
-            input_upper: program.input_upper.iter().map(|upper| upper + input).collect(),
-            input_offsets: (program.input_offsets.iter().zip(lengths.iter().cycle()))
-                .map(|(offset, length)| offset + input * length)
-                .collect(),
-            terminal_generators,
-        }
-    }
-
-    fn program<'a>(&'a self, original: &HorizonProgram<'a>) -> HorizonProgram<'a> {
-        HorizonProgram {
-            input_cost: 1.0,
-            tracking_weight: 0.0,
-            tracked_stages: 0,
-            stage_offsets: &self.stage_offsets,
-            input_lower: &self.input_lower,
-            input_upper: &self.input_upper,
-            input_offsets: &self.input_offsets,
-            terminal_generators: &self.terminal_generators,
-            ..*original
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::program::{PlantTables, RelaxedFamily, least_relaxation};
-
-    #[test]
-    fn relaxation_agrees_with_the_general_solver() {
-        // A double integrator asked to go 10 in 4 steps of at most 1, at a speed of at most 1.
-        let a = DMatrix::from_row_slice(2, 2, &[1.0, 1.0, 0.0, 1.0]);
-        let b = DMatrix::from_row_slice(2, 1, &[0.5, 1.0]);
-        let plant = PlantTables::new(&a, &b, 4);
-        let program = HorizonProgram {
-            plant: &plant,
-            initial: &[0.0, 0.0],
-            horizon: 4,
-            input_cost: 1.0,
-            input_lower: &[-1.0; 4],
-            input_upper: &[1.0; 4],
-            input_normals: &[],
-            input_offsets: &[],
-            stage_rows: 1,
-            constrained_stages: 3,
-            stage_normals: &[0.0, 1.0, 0.0, 1.0, 0.0, 1.0],
-            stage_offsets: &[1.0; 3],
-            tracking_weight: 0.0,
-            tracked_stages: 0,
-            tracking_reference: &[],
-            terminal_centre: &[3.5, 0.0],
-            terminal_generators: &[],
-            constant: 0.0,
-        };
-        for (family, relaxed) in [
-            (ConstraintFamily::State, RelaxedFamily::Stage),
-            (ConstraintFamily::Input, RelaxedFamily::Input),
-            (ConstraintFamily::Terminal, RelaxedFamily::Terminal),
-        ] {
-            let fast = relaxation(&program, family, None, Budget::UNLIMITED);
-            let general = least_relaxation(&program, relaxed);
-            match (fast, general) {
-                (Some(fast), Some(general)) => {
-                    assert!(
-                        fast / general < 1.051 && fast / general > 0.999,
-                        "{family:?} {fast} {general}"
-                    );
-                }
-                (None, None) => {}
-                other => panic!("{family:?}: {other:?}"),
-            }
-            // And nothing better than what is known is no news.
-            assert_eq!(relaxation(&program, family, Some(1e-3), Budget::UNLIMITED), None);
-        }
-    }
 }

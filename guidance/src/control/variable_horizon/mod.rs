@@ -63,6 +63,7 @@ mod encoding;
 mod inspect;
 mod present;
 mod problem;
+mod relaxation;
 mod search;
 mod stages;
 mod state;
@@ -87,7 +88,7 @@ use super::{Controller, PrepareError, StepError};
 use crate::budget::Budget;
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
-pub const VERSION: &str = "1";
+pub const VERSION: &str = "2";
 
 /// The method, as a [`Controller`].
 #[derive(Debug, Clone, Copy)]

@@ -7,7 +7,10 @@ use super::{
 use crate::{
     budget::{Budget, Interruption},
     control::Failure,
-    program::{Basis, Clarabel, DualSimplex, HorizonProgram, Multiplier, Solution, Solver, Status},
+    program::{
+        Basis, Clarabel, DualSimplex, HorizonProgram, Multiplier, RowFamily, Solution, Solver,
+        Status, farkas_margin,
+    },
 };
 
 /// The best horizon found, and what was tried.
@@ -45,6 +48,13 @@ pub(super) struct InfeasibleHorizon {
     pub(super) terminal: Option<Terminal>,
 }
 
+impl InfeasibleHorizon {
+    /// Last stage of a row in the proof.
+    fn last_stage(&self) -> usize {
+        self.ray.iter().flatten().map(|multiplier| multiplier.row.stage).max().unwrap_or(0)
+    }
+}
+
 /// Which terminal constraint a search uses.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Goal {
@@ -67,6 +77,9 @@ pub(super) struct Search<'a, 'b> {
     pub(super) general_solver_calls: usize,
     /// The infeasible horizon tried last.
     pub(super) infeasible: Option<InfeasibleHorizon>,
+    /// A proof from state rows alone: it holds for every horizon beyond the last of them, and for
+    /// every goal.
+    barrier: Option<InfeasibleHorizon>,
     /// The best feasible answer so far, kept for when time runs out.
     pub(super) incumbent: Option<Found>,
 }
@@ -89,6 +102,7 @@ impl<'a, 'b> Search<'a, 'b> {
             pivots: 0,
             general_solver_calls: 0,
             infeasible: None,
+            barrier: None,
             incumbent: None,
         }
     }
@@ -233,6 +247,11 @@ impl<'a, 'b> Search<'a, 'b> {
         cut_off: Option<f64>,
     ) -> Result<Tried, Failure> {
         self.budget.check()?;
+        if self.barrier.as_ref().is_some_and(|proof| proof.last_stage() < horizon) {
+            self.record(horizon, TrialOutcome::Infeasible);
+            self.infeasible.clone_from(&self.barrier);
+            return Ok(Tried::Infeasible);
+        }
         let Some(terminal) = self.terminal(goal, horizon) else {
             self.record(horizon, TrialOutcome::Infeasible);
             self.infeasible = Some(InfeasibleHorizon { horizon, ray: None, terminal: None });
@@ -261,10 +280,14 @@ impl<'a, 'b> Search<'a, 'b> {
                 Ok(Tried::CutOff)
             }
             Status::PrimalInfeasible => {
+                let barrier = barrier(&program, &solution.multipliers);
                 self.record(horizon, TrialOutcome::Infeasible);
                 let ray = Some(solution.multipliers);
-                self.infeasible =
-                    Some(InfeasibleHorizon { horizon, ray, terminal: Some(terminal) });
+                let proof = InfeasibleHorizon { horizon, ray, terminal: Some(terminal) };
+                if barrier.is_some() {
+                    self.barrier = Some(InfeasibleHorizon { ray: barrier, ..proof.clone() });
+                }
+                self.infeasible = Some(proof);
                 Ok(Tried::Infeasible)
             }
             status => Err(Failure::Numerical(format!("horizon {horizon}: {status:?}"))),
@@ -279,6 +302,16 @@ impl<'a, 'b> Search<'a, 'b> {
     pub(super) fn restart(&mut self) -> Vec<Trial> {
         std::mem::take(&mut self.trials)
     }
+}
+
+/// What is left of a ray without its terminal rows and rounding, if that is a proof by itself.
+fn barrier(program: &HorizonProgram<'_>, ray: &[Multiplier]) -> Option<Vec<Multiplier>> {
+    const ROUNDING: f64 = 1e-9;
+    let of_the_way = |m: &&Multiplier| matches!(m.row.family, RowFamily::Stage | RowFamily::Input);
+    let heaviest = ray.iter().filter(of_the_way).fold(0.0, |most, m| f64::max(most, m.value));
+    let rows = ray.iter().filter(of_the_way).filter(|m| m.value > ROUNDING * heaviest);
+    let rows: Vec<Multiplier> = rows.copied().collect();
+    (!rows.is_empty() && farkas_margin(program, &rows) > 0.0).then_some(rows)
 }
 
 /// The simplex, and the general solver when the simplex reports trouble.

@@ -20,6 +20,11 @@ impl Kernel {
         &self.inverse[column * self.size..][..self.size]
     }
 
+    /// Euclidean length of a row of the inverse.
+    pub(super) fn norm(&self, column: usize) -> f64 {
+        dot(self.row(column), self.row(column)).sqrt()
+    }
+
     fn at(&self, column: usize, row: usize) -> f64 {
         self.inverse[column * self.size + row]
     }
@@ -120,62 +125,73 @@ impl Kernel {
         }
     }
 
-    /// Inverts `matrix` (rows x columns, row by row) as far as it has rank, by complete pivoting.
+    /// Inverts `matrix` (rows x columns, row by row) as far as it has rank, by exchanging rows
+    /// with columns in place, each time at the largest entry left.
     ///
-    /// A pivot below `tolerance` times the largest entry ends it. Returns the kept (row, column) pairs of indices; the inverse is in that order.
+    /// A pivot below `tolerance` times the largest entry of all ends it. Returns the kept (row,
+    /// column) pairs of indices; the inverse is in that order.
     pub(super) fn factor(
         &mut self,
-        matrix: &[f64],
+        matrix: &mut [f64],
         rows: usize,
         columns: usize,
         tolerance: f64,
     ) -> Vec<(usize, usize)> {
-        self.clear();
         let mut kept: Vec<(usize, usize)> = Vec::with_capacity(rows.min(columns));
-        let mut free_rows: Vec<usize> = (0..rows).collect();
-        let mut free_columns: Vec<usize> = (0..columns).collect();
-        // Schur complement of the kept pairs, updated in place.
-        let mut rest = matrix.to_vec();
-        let largest = rest.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
-        while let Some((i, j)) = largest_entry(&rest, columns, &free_rows, &free_columns) {
-            let pivot = rest[i * columns + j];
+        let mut row_is_free = vec![true; rows];
+        let mut column_is_free = vec![true; columns];
+        let mut largest = 0.0;
+        while let Some((i, j)) = largest_entry(matrix, &row_is_free, &column_is_free) {
+            let pivot = matrix[i * columns + j];
+            if kept.is_empty() {
+                largest = pivot.abs();
+            }
             if pivot.abs() <= tolerance * largest {
                 break;
             }
-            for &r in free_rows.iter().filter(|&&r| r != i) {
-                let weight = rest[r * columns + j] / pivot;
-                for &c in &free_columns {
-                    rest[r * columns + c] -= weight * rest[i * columns + c];
-                }
-            }
-            let left: Vec<f64> = kept.iter().map(|&(r, _)| matrix[r * columns + j]).collect();
-            let top: Vec<f64> = kept.iter().map(|&(_, c)| matrix[i * columns + c]).collect();
-            let (mut column, mut row) = (Vec::new(), Vec::new());
-            self.solve(&left, &mut column);
-            self.solve_transposed(&top, &mut row);
-            let schur = matrix[i * columns + j] - dot(&top, &column);
-            self.border(&column, &row, schur);
+            self.exchange(matrix, columns, (i, j));
             kept.push((i, j));
-            free_rows.retain(|&r| r != i);
-            free_columns.retain(|&c| c != j);
+            row_is_free[i] = false;
+            column_is_free[j] = false;
+        }
+        self.size = kept.len();
+        self.inverse.clear();
+        for &(i, _) in &kept {
+            self.inverse.extend(kept.iter().map(|&(_, j)| matrix[i * columns + j]));
         }
         kept
+    }
+
+    /// From y = M x to the same relation solved for x_j, with y_i on the other side.
+    fn exchange(&mut self, matrix: &mut [f64], columns: usize, (i, j): (usize, usize)) {
+        let pivot = matrix[i * columns + j];
+        self.scratch.clear();
+        self.scratch.extend(matrix[i * columns..][..columns].iter().map(|entry| -entry / pivot));
+        self.scratch[j] = 1.0 / pivot;
+        for (r, row) in matrix.chunks_exact_mut(columns).enumerate() {
+            if r == i {
+                row.copy_from_slice(&self.scratch);
+                continue;
+            }
+            let weight = row[j];
+            row[j] = 0.0;
+            row.iter_mut().zip(&self.scratch).for_each(|(entry, p)| *entry += weight * p);
+        }
     }
 }
 
 fn largest_entry(
     matrix: &[f64],
-    columns: usize,
-    free_rows: &[usize],
-    free_columns: &[usize],
+    row_is_free: &[bool],
+    column_is_free: &[bool],
 ) -> Option<(usize, usize)> {
     let mut best = None;
     let mut largest = 0.0;
-    for &i in free_rows {
-        for &j in free_columns {
-            let size = matrix[i * columns + j].abs();
-            if size > largest {
-                largest = size;
+    let rows = matrix.chunks_exact(column_is_free.len().max(1)).zip(row_is_free).enumerate();
+    for (i, (row, _)) in rows.filter(|(_, (_, free))| **free) {
+        for (j, (entry, free)) in row.iter().zip(column_is_free).enumerate() {
+            if *free && entry.abs() > largest {
+                largest = entry.abs();
                 best = Some((i, j));
             }
         }
@@ -183,8 +199,18 @@ fn largest_entry(
     best
 }
 
-pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
+/// Sum of products, four sums at a time: one alone would wait for itself at every term.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let (a, a_rest) = a.as_chunks::<4>();
+    let (b, b_rest) = b.as_chunks::<4>();
+    let mut sums = [0.0; 4];
+    for (a, b) in a.iter().zip(b) {
+        for i in 0..4 {
+            sums[i] += a[i] * b[i];
+        }
+    }
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum();
+    (sums[0] + sums[2]) + (sums[1] + sums[3]) + rest
 }
 
 #[cfg(test)]
@@ -206,9 +232,9 @@ mod tests {
     #[test]
     fn updates_agree_with_the_definition() {
         let mut m = vec![vec![2.0, 1.0, 0.5], vec![-1.0, 3.0, 1.0], vec![0.3, -0.7, 1.5]];
-        let flat: Vec<f64> = m.concat();
+        let mut flat: Vec<f64> = m.concat();
         let mut kernel = Kernel::default();
-        let kept = kernel.factor(&flat, 3, 3, 1e-9);
+        let kept = kernel.factor(&mut flat, 3, 3, 1e-9);
         // Reorder M as the factorisation kept it.
         m = kept.iter().map(|&(r, _)| kept.iter().map(|&(_, c)| m[r][c]).collect()).collect();
         check(&kernel, &m);
@@ -252,9 +278,9 @@ mod tests {
     fn factor_drops_what_has_no_rank() {
         let mut kernel = Kernel::default();
         // The third row is the sum of the first two.
-        let kept = kernel.factor(&[1.0, 2.0, 0.0, 1.0, 1.0, 3.0], 3, 2, 1e-9);
+        let kept = kernel.factor(&mut [1.0, 2.0, 0.0, 1.0, 1.0, 3.0], 3, 2, 1e-9);
         assert_eq!(kept.len(), 2);
-        let kept = kernel.factor(&[1.0, 2.0, 2.0, 4.0], 2, 2, 1e-9);
+        let kept = kernel.factor(&mut [1.0, 2.0, 2.0, 4.0], 2, 2, 1e-9);
         assert_eq!(kept.len(), 1);
     }
 }

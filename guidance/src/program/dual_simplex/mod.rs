@@ -1,8 +1,9 @@
 //! A bounded dual simplex for [`HorizonProgram`]s that never forms the matrix.
 //!
 //! The program has hundreds of rows and a hundred columns, but at any vertex only a dozen rows
-//! hold with equality. So the rows are evaluated by rolling the plant forward, and only the
-//! active ones are kept as coefficients, with the explicit inverse of their square kernel.
+//! hold with equality. So the rows are evaluated by rolling the plant forward, gradients by
+//! rolling costates back, both in the anchored form of [`Anchors`](super::anchors::Anchors), where an input only adds; and
+//! of the active rows there is nothing but the explicit inverse of their square kernel.
 //!
 //! The cost |v| and the bounds of an input make one convex piecewise linear function of one
 //! column: columns rest at a breakpoint, or are basic strictly between two. Every input is
@@ -21,10 +22,12 @@ mod kernel;
 mod pivot;
 mod ratio;
 
-use kernel::{Kernel, dot};
+use kernel::Kernel;
 
 use super::{
     BasicColumn, Basis, HorizonProgram, Multiplier, RowFamily, RowId, Solution, Solver, Status,
+    anchors::dot,
+    tables::add_scaled,
     verify::{dual_bound, farkas_margin},
 };
 use crate::budget::{Budget, Interruption};
@@ -57,6 +60,8 @@ pub struct DualSimplex {
     // Columns: inputs stage by stage, then terminal coefficients.
     columns: Vec<Column>,
     place: Vec<Place>,
+    /// The gradients, falling and rising, at which a column leaves its place.
+    limits: Vec<[f64; 2]>,
     values: Vec<f64>,
     /// Gradient of the Lagrangian without the column's own cost: d = A'y.
     gradient: Vec<f64>,
@@ -65,29 +70,39 @@ pub struct DualSimplex {
     // Rows.
     layout: Layout,
     scale: Vec<f64>,
+    /// Stage rows as they stand on anchored states, scaled, n values a row.
+    stage_rows: Vec<f64>,
+    /// Their scaled right sides.
+    stage_sides: Vec<f64>,
     /// Position in `active`, or `INACTIVE`.
     position: Vec<u32>,
     /// At which bound an inactive tracking row's multiplier rests.
     at_upper: Vec<bool>,
-    /// States under zero input, and under `values`.
-    free_states: Vec<f64>,
+    /// Anchored states under `values`.
     states: Vec<f64>,
+    /// Sum of the terminal generators under `values`.
+    reached: Vec<f64>,
     // The vertex.
     active: Vec<ActiveRow>,
-    /// One row of `columns.len()` coefficients an active row.
-    coefficients: Vec<f64>,
+    /// The images of each active row, one a block of the anchors.
+    images: Vec<f64>,
     basic: Vec<usize>,
     kernel: Kernel,
     // Scratch of one pivot.
-    leaving_coefficients: Vec<f64>,
+    leaving_images: Vec<f64>,
+    /// Values of one row on the basic columns, or of one column on the active rows.
+    line: Vec<f64>,
     rho: Vec<f64>,
     multiplier_step: Vec<f64>,
     entering: Vec<f64>,
-    lengths: Vec<f64>,
-    events: Vec<ratio::Candidate>,
+    candidates: Vec<ratio::Candidate>,
+    tied: Vec<ratio::Candidate>,
     passed: Vec<ratio::Candidate>,
-    right_sides: Vec<f64>,
+    /// Resting columns that moved in this pivot, and by how much.
+    moved: Vec<(usize, f64)>,
+    basic_values: Vec<f64>,
     costates: Vec<f64>,
+    costate: Vec<f64>,
     stalled: usize,
     drift: f64,
 }
@@ -116,10 +131,9 @@ enum Place {
 #[derive(Debug, Clone, Copy)]
 struct ActiveRow {
     index: usize,
+    id: RowId,
     /// Scaled multiplier.
     multiplier: f64,
-    /// Right side minus what the resting columns contribute.
-    right: f64,
 }
 
 /// Index ranges of the row families.
@@ -162,6 +176,14 @@ impl Column {
 
     fn last(&self) -> u8 {
         self.count - 1
+    }
+
+    /// The gradients, falling and rising, at which the column leaves breakpoint `point`. A falling
+    /// gradient pulls it up.
+    fn limits(&self, point: u8) -> [f64; 2] {
+        let above = (point < self.last()).then(|| -self.slopes[point as usize]);
+        let below = (point > 0).then(|| -self.slopes[point as usize - 1]);
+        [above.unwrap_or(f64::NEG_INFINITY), below.unwrap_or(f64::INFINITY)]
     }
 
     /// The breakpoint that minimises cost + gradient v.
@@ -240,7 +262,7 @@ impl Solver for DualSimplex {
 }
 
 impl DualSimplex {
-    /// Columns, row scales and free response of `program`, at the vertex v = argmin cost, y = 0.
+    /// Columns, rows and free response of `program`, at the vertex v = argmin cost, y = 0.
     fn load(&mut self, program: &HorizonProgram<'_>) {
         let (n, m, horizon) = (program.states(), program.inputs(), program.horizon);
         let generators = program.terminal_generator_count();
@@ -252,35 +274,48 @@ impl DualSimplex {
         let count = self.columns.len();
         self.place.clear();
         self.place.resize(count, Place::At(0));
+        self.limits.clear();
+        self.limits.extend(self.columns.iter().map(|column| column.limits(0)));
         reset(&mut self.values, count);
         reset(&mut self.gradient, count);
         reset(&mut self.gradient_step, count);
-        reset(&mut self.leaving_coefficients, count);
-        reset(&mut self.free_states, (horizon + 1) * n);
+        reset(&mut self.reached, n);
         reset(&mut self.states, (horizon + 1) * n);
-        self.free_states[..n].copy_from_slice(program.initial);
-        program.plant.roll_forward(&self.values[..horizon * m], &mut self.free_states);
-        self.load_rows(program);
+        // An input row has no images; their space holds its coefficients.
+        let space = (program.plant.anchors().blocks(horizon) * n).max(m);
+        reset(&mut self.leaving_images, space);
         self.active.clear();
-        self.coefficients.clear();
+        self.images.clear();
         self.basic.clear();
         self.kernel.clear();
         self.stalled = 0;
         self.drift = DRIFT;
+        self.roll_forward(program);
+        self.load_rows(program);
     }
 
     fn load_rows(&mut self, program: &HorizonProgram<'_>) {
         let (n, horizon) = (program.states(), program.horizon);
+        let anchors = program.plant.anchors();
         let tracked = if program.tracking_weight > 0.0 { program.tracked_stages } else { 0 };
         let tracking = program.constrained_stages * program.stage_rows;
         let input = tracking + tracked * n;
         let terminal = input + horizon * program.input_rows();
         self.layout = Layout { tracking, input, terminal, end: terminal + n };
         self.scale.clear();
+        self.scale.reserve(self.layout.end);
+        self.stage_sides.clear();
+        self.stage_sides.reserve(tracking);
+        reset(&mut self.stage_rows, tracking * n);
+        let mut rows = self.stage_rows.chunks_exact_mut(n);
         for stage in 1..=program.constrained_stages {
             let reach = program.plant.reach(stage);
-            for row in 0..program.stage_rows {
-                self.scale.push(row_scale(program.stage_normal(stage, row), reach));
+            for (row, out) in (0..program.stage_rows).zip(&mut rows) {
+                let normal = program.stage_normal(stage, row);
+                let scale = row_scale(normal, reach);
+                anchors.row(normal, stage, scale, out);
+                self.stage_sides.push(scale * program.stage_offset(stage, row));
+                self.scale.push(scale);
             }
         }
         for stage in 1..=tracked {
@@ -297,9 +332,9 @@ impl DualSimplex {
         self.position.resize(self.layout.end, INACTIVE);
         // A tracking multiplier rests where the free response's residual puts it.
         self.at_upper.clear();
-        for stage in 1..=tracked {
-            let z = &self.free_states[stage * n..][..n];
-            self.at_upper.extend(z.iter().zip(program.reference(stage)).map(|(z, r)| z > r));
+        for index in tracking..input {
+            let above = self.residual(program, index) > 0.0;
+            self.at_upper.push(above);
         }
     }
 
@@ -331,66 +366,63 @@ impl DualSimplex {
         rows.sort_unstable();
         rows.dedup();
         for (index, segment) in columns {
-            self.place[index] = Place::Basic { segment };
+            self.put(index, Place::Basic { segment });
             self.basic.push(index);
         }
         for index in rows {
             self.position[index] = 0;
-            self.active.push(ActiveRow { index, multiplier: 0.0, right: 0.0 });
+            let id = self.row_id(program, index);
+            self.active.push(ActiveRow { index, id, multiplier: 0.0 });
         }
     }
 
-    /// Everything anew from the names of active rows and basic columns: coefficients, kernel,
-    /// multipliers, gradient, resting places, values. Rows and columns without rank are dropped,
-    /// then rows whose multiplier has the wrong sign.
+    /// Everything anew from the names of active rows and basic columns: kernel, multipliers,
+    /// gradient, resting places. Rows and columns without rank are dropped, then rows whose
+    /// multiplier has the wrong sign.
     fn refresh(&mut self, program: &HorizonProgram<'_>, rank_tolerance: f64) {
         let (rows, columns) = (self.active.len(), self.basic.len());
-        let count = self.columns.len();
-        self.coefficients.clear();
-        self.coefficients.resize(rows * count, 0.0);
+        let stride = self.leaving_images.len();
+        self.images.clear();
+        let mut matrix = Vec::with_capacity(rows * columns);
         for i in 0..rows {
-            let index = self.active[i].index;
-            let mut line = std::mem::take(&mut self.leaving_coefficients);
-            self.row_coefficients(program, index, &mut line);
-            self.coefficients[i * count..][..count].copy_from_slice(&line);
-            self.leaving_coefficients = line;
+            let ActiveRow { index, id, .. } = self.active[i];
+            self.load_images(program, index);
+            let images = &self.leaving_images;
+            let entry = |&column: &usize| self.coefficient(program, id, images, column);
+            matrix.extend(self.basic.iter().map(entry));
+            self.images.extend_from_slice(&self.leaving_images);
         }
-        let matrix: Vec<f64> = (0..rows)
-            .flat_map(|i| self.basic.iter().map(move |&c| (i, c)))
-            .map(|(i, c)| self.coefficients[i * count + c])
-            .collect();
-        let kept = self.kernel.factor(&matrix, rows, columns, rank_tolerance);
-        self.keep(&kept);
-        self.settle_multipliers(program);
-        self.rest_columns();
-        self.load_right_sides(program);
+        let kept = self.kernel.factor(&mut matrix, rows, columns, rank_tolerance);
+        self.keep(&kept, stride);
+        self.settle(program);
     }
 
     /// Reduces the vertex to the kept (row, column) pairs, in their order.
-    fn keep(&mut self, kept: &[(usize, usize)]) {
-        let count = self.columns.len();
+    fn keep(&mut self, kept: &[(usize, usize)], stride: usize) {
         let (active, basic) = (self.active.clone(), self.basic.clone());
-        let coefficients = std::mem::take(&mut self.coefficients);
+        let images = std::mem::take(&mut self.images);
         for row in &active {
             self.position[row.index] = INACTIVE;
         }
         for (j, &column) in basic.iter().enumerate() {
             if !kept.iter().any(|&(_, c)| c == j) {
-                self.place[column] = Place::At(0);
+                self.put(column, Place::At(0));
             }
         }
         self.active = kept.iter().map(|&(r, _)| active[r]).collect();
         self.basic = kept.iter().map(|&(_, c)| basic[c]).collect();
         for &(r, _) in kept {
-            self.coefficients.extend_from_slice(&coefficients[r * count..][..count]);
+            self.images.extend_from_slice(&images[r * stride..][..stride]);
         }
-        self.number_rows();
-    }
-
-    fn number_rows(&mut self) {
         for (i, row) in self.active.iter().enumerate() {
             self.position[row.index] = u32::try_from(i).unwrap_or(INACTIVE);
         }
+    }
+
+    /// Multipliers, gradient and resting places anew from the kernel.
+    fn settle(&mut self, program: &HorizonProgram<'_>) {
+        self.settle_multipliers(program);
+        self.rest_columns();
     }
 
     /// Multipliers that put every basic column on its slope; drops rows with wrong signs.
@@ -399,110 +431,84 @@ impl DualSimplex {
             for row in &mut self.active {
                 row.multiplier = 0.0;
             }
-            // Gradient from the resting tracking rows alone, then what is missing to the slopes.
+            // From the resting tracking rows alone, then once more for what rounding left over.
             self.load_gradient(program);
-            let missing: Vec<f64> =
-                (self.basic.iter()).map(|&c| -self.basic_slope(c) - self.gradient[c]).collect();
-            let mut multipliers = Vec::new();
-            self.kernel.solve_transposed(&missing, &mut multipliers);
-            let worst = (0..self.active.len())
-                .map(|i| {
-                    let (lower, upper) = self.multiplier_range(program, self.active[i].index);
-                    let y = multipliers[i];
-                    (i, (lower - y).max(y - upper), y > upper)
-                })
-                .max_by(|a, b| a.1.total_cmp(&b.1));
-            match worst {
-                Some((i, excess, above)) if excess > self.drift * (1.0 + multipliers[i].abs()) => {
-                    let index = self.active[i].index;
-                    let partner = self.kernel.partner_of_row(i);
-                    self.place[self.basic[partner]] = Place::At(0);
-                    self.drop_pair(partner, i);
-                    if self.is_tracking(index) {
-                        self.at_upper[index - self.layout.tracking] = above;
-                    }
+            for _ in 0..2 {
+                let mut line = std::mem::take(&mut self.line);
+                line.clear();
+                let missing = |&c: &usize| -self.basic_slope(c) - self.gradient[c];
+                line.extend(self.basic.iter().map(missing));
+                self.line = line;
+                self.kernel.solve_transposed(&self.line, &mut self.rho);
+                for (row, change) in self.active.iter_mut().zip(&self.rho) {
+                    row.multiplier += change;
                 }
-                _ => {
-                    for (row, y) in self.active.iter_mut().zip(&multipliers) {
-                        row.multiplier = *y;
-                    }
-                    break;
-                }
+                self.load_gradient(program);
+            }
+            let excess = |(i, row): (usize, &ActiveRow)| {
+                let (lower, upper) = self.multiplier_range(program, row.index);
+                (i, (lower - row.multiplier).max(row.multiplier - upper))
+            };
+            let worst = self.active.iter().enumerate().map(excess);
+            let Some((i, excess)) = worst.max_by(|a, b| a.1.total_cmp(&b.1)) else { return };
+            let ActiveRow { index, multiplier, .. } = self.active[i];
+            if excess <= self.drift * (1.0 + multiplier.abs()) {
+                return;
+            }
+            let partner = self.kernel.partner_of_row(i);
+            self.put(self.basic[partner], Place::At(0));
+            self.drop_pair(partner, i);
+            if self.is_tracking(index) {
+                self.at_upper[index - self.layout.tracking] = multiplier > 0.0;
             }
         }
-        self.load_gradient(program);
     }
 
-    /// d = A'y over all rows, by the costate recursion.
+    /// d = A'y over all rows.
     fn load_gradient(&mut self, program: &HorizonProgram<'_>) {
-        let (n, m, horizon) = (program.states(), program.inputs(), program.horizon);
-        let mut costates = std::mem::take(&mut self.costates);
-        reset(&mut costates, (horizon + 1) * n);
-        reset(&mut self.gradient, self.columns.len());
+        let mut gradient = std::mem::take(&mut self.gradient);
+        self.start_gradient(program, &mut gradient);
         for i in 0..self.active.len() {
-            let ActiveRow { index, multiplier, .. } = self.active[i];
-            self.add_row(program, index, multiplier * self.scale[index], &mut costates);
+            let ActiveRow { id, multiplier, .. } = self.active[i];
+            let images = &self.images[i * self.leaving_images.len()..];
+            add_row(program, id, multiplier, images, &mut self.costates, &mut gradient);
         }
         for index in self.layout.tracking..self.layout.input {
             if self.position[index] == INACTIVE {
                 let weight = self.resting_multiplier(program, index);
-                self.add_row(program, index, weight, &mut costates);
+                let RowId { stage, index, .. } = self.row_id(program, index);
+                let row = program.plant.anchors().component(stage, index);
+                let n = program.states();
+                add_scaled(&mut self.costates[stage * n..][..n], row, weight);
             }
         }
-        let mut carried = vec![0.0; n];
-        for stage in (1..=horizon).rev() {
-            let costate = &mut costates[stage * n..][..n];
-            for (value, from_later) in costate.iter_mut().zip(&carried) {
-                *value += from_later;
-            }
-            let mut slope = [0.0; 16];
-            let slope = &mut slope[..m.min(16)];
-            if m <= 16 {
-                program.plant.input_gradient(costate, slope);
-                for (value, s) in self.gradient[(stage - 1) * m..].iter_mut().zip(slope.iter()) {
-                    *value += s;
-                }
-            } else {
-                let mut slope = vec![0.0; m];
-                program.plant.input_gradient(costate, &mut slope);
-                for (value, s) in self.gradient[(stage - 1) * m..].iter_mut().zip(&slope) {
-                    *value += s;
-                }
-            }
-            program.plant.costate_back(costate, &mut carried);
-        }
-        self.costates = costates;
+        self.finish_gradient(program, &mut gradient);
+        self.gradient = gradient;
     }
 
-    /// Adds `weight` times a row's left side to the costates, or to the gradient directly.
-    fn add_row(
-        &mut self,
-        program: &HorizonProgram<'_>,
-        index: usize,
-        weight: f64,
-        costates: &mut [f64],
-    ) {
-        let (n, m) = (program.states(), program.inputs());
-        let id = self.row_id(program, index);
-        match id.family {
-            RowFamily::Stage => {
-                let normal = program.stage_normal(id.stage, id.index);
-                super::tables::add_scaled(&mut costates[id.stage * n..][..n], normal, weight);
-            }
-            RowFamily::Tracking => costates[id.stage * n + id.index] += weight,
-            RowFamily::Input => {
-                let normal = &program.input_normals[id.index * m..][..m];
-                let gradient = &mut self.gradient[id.stage * m..][..m];
-                super::tables::add_scaled(gradient, normal, weight);
-            }
-            RowFamily::Terminal => {
-                costates[program.horizon * n + id.index] += weight;
-                let first = program.horizon * m;
-                for (e, generator) in program.terminal_generators.chunks_exact(n).enumerate() {
-                    self.gradient[first + e] -= weight * generator[id.index];
-                }
-            }
+    fn start_gradient(&mut self, program: &HorizonProgram<'_>, gradient: &mut [f64]) {
+        // One stage more than there is holds what terminal rows ask of the generators.
+        reset(&mut self.costates, (program.horizon + 2) * program.states());
+        gradient.fill(0.0);
+    }
+
+    fn finish_gradient(&mut self, program: &HorizonProgram<'_>, gradient: &mut [f64]) {
+        let n = program.states();
+        let (inputs, coefficients) = gradient.split_at_mut(program.horizon * program.inputs());
+        program.plant.anchors().add_gradient(&self.costates, &mut self.costate, inputs);
+        let terminal = &self.costates[(program.horizon + 1) * n..];
+        let generators = program.terminal_generators.chunks_exact(n);
+        for (value, generator) in coefficients.iter_mut().zip(generators) {
+            *value = -dot(generator, terminal);
         }
+    }
+
+    fn put(&mut self, column: usize, place: Place) {
+        self.place[column] = place;
+        self.limits[column] = match place {
+            Place::At(point) => self.columns[column].limits(point),
+            Place::Basic { .. } => [f64::NEG_INFINITY, f64::INFINITY],
+        };
     }
 
     /// Puts every resting column where its gradient wants it.
@@ -516,57 +522,65 @@ impl DualSimplex {
                 } else {
                     column.resting_point(self.gradient[i])
                 };
-                self.place[i] = Place::At(point);
+                self.put(i, Place::At(point));
                 self.values[i] = self.columns[i].points[point as usize];
             }
         }
     }
 
-    fn load_right_sides(&mut self, program: &HorizonProgram<'_>) {
-        for i in 0..self.active.len() {
-            let index = self.active[i].index;
-            let line = &self.coefficients[i * self.columns.len()..][..self.columns.len()];
-            let resting = self.resting_contribution(line);
-            self.active[i].right = -self.free_residual(program, index) - resting;
+    /// Images of row `index` into `leaving_images`.
+    fn load_images(&mut self, program: &HorizonProgram<'_>, index: usize) {
+        let RowId { family, stage, index: c } = self.row_id(program, index);
+        let anchors = program.plant.anchors();
+        let n = program.states();
+        match family {
+            RowFamily::Stage => {
+                anchors.images(&self.stage_rows[index * n..][..n], stage, &mut self.leaving_images);
+            }
+            RowFamily::Tracking | RowFamily::Terminal => {
+                reset(&mut self.costate, n);
+                add_scaled(&mut self.costate, anchors.component(stage, c), self.scale[index]);
+                anchors.images(&self.costate, stage, &mut self.leaving_images);
+            }
+            RowFamily::Input => {
+                let m = program.inputs();
+                let normal = &program.input_normals[c * m..][..m];
+                self.leaving_images.fill(0.0);
+                add_scaled(&mut self.leaving_images, normal, self.scale[index]);
+            }
         }
     }
 
-    fn resting_contribution(&self, line: &[f64]) -> f64 {
-        let terms = line.iter().zip(&self.values).zip(&self.place);
-        terms.map(|((a, v), place)| if let Place::At(_) = place { a * v } else { 0.0 }).sum()
+    fn images_of(&self, position: usize) -> &[f64] {
+        let stride = self.leaving_images.len();
+        &self.images[position * stride..][..stride]
     }
 
-    /// Scaled residual of a row under zero input and zero terminal coefficients.
-    fn free_residual(&self, program: &HorizonProgram<'_>, index: usize) -> f64 {
-        let id = self.row_id(program, index);
-        self.scale[index] * residual(program, id, &self.free_states, None)
-    }
-
-    /// Scaled coefficients of a row on all columns.
-    fn row_coefficients(&self, program: &HorizonProgram<'_>, index: usize, out: &mut [f64]) {
+    /// Scaled coefficient of a row, given by its images, on a column.
+    fn coefficient(
+        &self,
+        program: &HorizonProgram<'_>,
+        id: RowId,
+        images: &[f64],
+        column: usize,
+    ) -> f64 {
         let (n, m) = (program.states(), program.inputs());
-        let id = self.row_id(program, index);
-        let scale = self.scale[index];
-        out.fill(0.0);
+        let (stage, c) = (column / m, column % m);
         match id.family {
-            RowFamily::Stage => {
-                let normal = program.stage_normal(id.stage, id.index);
-                program.plant.coefficients(normal, id.stage, scale, out);
-            }
-            RowFamily::Tracking => unit_coefficients(program, id.stage, id.index, scale, out),
             RowFamily::Input => {
-                let normal = &program.input_normals[id.index * m..][..m];
-                for (value, h) in out[id.stage * m..].iter_mut().zip(normal) {
-                    *value = scale * h;
+                if stage == id.stage {
+                    images[c]
+                } else {
+                    0.0
                 }
             }
+            _ if stage < id.stage => program.plant.anchors().coefficient(images, stage, c),
             RowFamily::Terminal => {
-                unit_coefficients(program, program.horizon, id.index, scale, out);
-                let generators = program.terminal_generators.chunks_exact(n);
-                for (value, generator) in out[program.horizon * m..].iter_mut().zip(generators) {
-                    *value = -scale * generator[id.index];
-                }
+                let generator = column - program.horizon * m;
+                let scale = self.scale[self.layout.terminal + id.index];
+                -scale * program.terminal_generators[generator * n + id.index]
             }
+            RowFamily::Stage | RowFamily::Tracking => 0.0,
         }
     }
 
@@ -579,6 +593,7 @@ impl DualSimplex {
         budget: Budget<'_>,
     ) -> Result<End, Interruption> {
         let mut since_refresh = 0;
+        let mut settled = true;
         self.load_values(program);
         let mut bound = self.lagrangian(program);
         loop {
@@ -588,50 +603,108 @@ impl DualSimplex {
             if cut_off.is_some_and(|limit| bound >= limit) {
                 return Ok(End::CutOff(bound));
             }
-            let leaving = self.price(program);
-            if let Some(leaving) = leaving {
-                if *pivots >= limit {
-                    return Ok(End::Exhausted);
+            let Some(leaving) = self.price(program) else {
+                if settled {
+                    return Ok(End::Optimal);
                 }
-                self.direction(program, leaving);
-                match self.ratio_test(program, leaving) {
-                    ratio::Outcome::Step { candidate, sound } => {
-                        self.pivot(program, leaving, candidate);
-                        let progress = candidate.gain > 1e-12 * (1.0 + bound.abs());
-                        self.stalled = if progress { 0 } else { self.stalled + 1 };
-                        bound += candidate.gain;
-                        since_refresh = if sound { since_refresh + 1 } else { REFRESH_PERIOD };
-                    }
-                    ratio::Outcome::Unbounded => return Ok(End::Infeasible(leaving)),
+                // Once by the kernel as it is; if the optimum comes apart, by a new one.
+                if self.drift == DRIFT {
+                    self.settle(program);
+                } else {
+                    self.refresh(program, SAME_VERTEX);
+                    since_refresh = 0;
                 }
-                *pivots += 1;
-            } else if since_refresh == 0 {
-                return Ok(End::Optimal);
-            }
-            if leaving.is_none() || since_refresh >= REFRESH_PERIOD {
-                self.refresh(program, SAME_VERTEX);
-                if leaving.is_none() {
-                    self.drift = (10.0 * self.drift).min(DRIFT_MAX);
-                }
-                since_refresh = 0;
+                self.drift = (10.0 * self.drift).min(DRIFT_MAX);
+                settled = true;
                 self.load_values(program);
                 bound = self.lagrangian(program);
+                continue;
+            };
+            if *pivots >= limit {
+                return Ok(End::Exhausted);
+            }
+            self.direction(program, leaving);
+            let ratio::Outcome::Step { candidate, sound } = self.ratio_test(program, leaving)
+            else {
+                return Ok(End::Infeasible(leaving));
+            };
+            self.pivot(program, leaving, candidate);
+            let progress = candidate.gain > 1e-12 * (1.0 + bound.abs());
+            self.stalled = if progress { 0 } else { self.stalled + 1 };
+            bound += candidate.gain;
+            *pivots += 1;
+            settled = false;
+            since_refresh += 1;
+            if sound && since_refresh < REFRESH_PERIOD {
+                self.move_values(program, leaving);
             } else {
+                self.refresh(program, SAME_VERTEX);
+                (since_refresh, settled) = (0, true);
                 self.load_values(program);
+                bound = self.lagrangian(program);
             }
         }
     }
 
-    /// Values of the basic columns and the states they lead to.
+    /// Values of the basic columns, such that the active rows hold, and the states of all.
     fn load_values(&mut self, program: &HorizonProgram<'_>) {
-        self.right_sides.clear();
-        self.right_sides.extend(self.active.iter().map(|row| row.right));
-        for (i, &column) in self.basic.iter().enumerate() {
-            self.values[column] = dot(self.kernel.row(i), &self.right_sides);
+        for &column in &self.basic {
+            self.values[column] = 0.0;
         }
-        let (n, m) = (program.states(), program.inputs());
+        self.roll_forward(program);
+        if self.basic.is_empty() {
+            return;
+        }
+        self.line.clear();
+        for i in 0..self.active.len() {
+            let missing = -self.residual(program, self.active[i].index);
+            self.line.push(missing);
+        }
+        self.kernel.solve(&self.line, &mut self.basic_values);
+        for (&column, value) in self.basic.iter().zip(&self.basic_values) {
+            self.values[column] = *value;
+        }
+        self.roll_forward(program);
+    }
+
+    /// The same after a pivot, from what moved in it; anew where so much moved that it is cheaper.
+    fn move_values(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) {
+        if self.moved.len() * self.active.len() > self.columns.len() {
+            self.load_values(program);
+            return;
+        }
+        let mut line = std::mem::take(&mut self.line);
+        line.clear();
+        for (i, row) in self.active.iter().enumerate() {
+            let images = self.images_of(i);
+            let shift = |&(column, change): &(usize, f64)| {
+                change * self.coefficient(program, row.id, images, column)
+            };
+            line.push(-self.moved.iter().map(shift).sum::<f64>());
+        }
+        if let Leaving::Row { index, residual } = leaving
+            && let Some(missing) = line.get_mut(self.position[index] as usize)
+        {
+            *missing -= residual;
+        }
+        self.kernel.solve(&line, &mut self.basic_values);
+        self.line = line;
+        for (&column, change) in self.basic.iter().zip(&self.basic_values) {
+            self.values[column] += change;
+        }
+        self.roll_forward(program);
+    }
+
+    /// Anchored states and sum of generators under `values`.
+    fn roll_forward(&mut self, program: &HorizonProgram<'_>) {
+        let n = program.states();
         self.states[..n].copy_from_slice(program.initial);
-        program.plant.roll_forward(&self.values[..program.horizon * m], &mut self.states);
+        let (inputs, coefficients) = self.values.split_at(program.horizon * program.inputs());
+        program.plant.anchors().roll_forward(inputs, &mut self.states);
+        self.reached.fill(0.0);
+        for (generator, &xi) in program.terminal_generators.chunks_exact(n).zip(coefficients) {
+            add_scaled(&mut self.reached, generator, xi);
+        }
     }
 
     /// The dual objective: the Lagrangian at the columns that minimise it.
@@ -645,9 +718,8 @@ impl DualSimplex {
         }
         for index in self.layout.tracking..self.layout.input {
             if self.position[index] == INACTIVE {
-                let id = self.row_id(program, index);
                 let weight = self.resting_multiplier(program, index);
-                total += weight * residual(program, id, &self.states, None);
+                total += weight * self.residual(program, index) / self.scale[index];
             }
         }
         total
@@ -657,10 +729,36 @@ impl DualSimplex {
         let costs = self.columns.iter().zip(&self.values).map(|(c, v)| c.cost(*v));
         let mut total = program.constant + costs.sum::<f64>();
         for index in self.layout.tracking..self.layout.input {
-            let id = self.row_id(program, index);
-            total += program.tracking_weight * residual(program, id, &self.states, None).abs();
+            let deviation = self.residual(program, index) / self.scale[index];
+            total += program.tracking_weight * deviation.abs();
         }
         total
+    }
+
+    /// Scaled left side minus right side of a row at `states`, `values` and `reached`.
+    fn residual(&self, program: &HorizonProgram<'_>, index: usize) -> f64 {
+        let (n, m) = (program.states(), program.inputs());
+        let RowId { family, stage, index: c } = self.row_id(program, index);
+        let w = &self.states[stage * n..][..n];
+        match family {
+            RowFamily::Stage => {
+                dot(&self.stage_rows[index * n..][..n], w) - self.stage_sides[index]
+            }
+            RowFamily::Tracking => {
+                let z = dot(program.plant.anchors().component(stage, c), w);
+                self.scale[index] * (z - program.reference(stage)[c])
+            }
+            RowFamily::Input => {
+                let left =
+                    dot(&program.input_normals[c * m..][..m], &self.values[stage * m..][..m]);
+                let right = program.input_offsets[stage * program.input_rows() + c];
+                self.scale[index] * (left - right)
+            }
+            RowFamily::Terminal => {
+                let z = dot(program.plant.anchors().component(stage, c), w);
+                self.scale[index] * (z - program.terminal_centre[c] - self.reached[c])
+            }
+        }
     }
 
     /// The violated column or row that leaves, if any: the largest violation per unit dual step, or
@@ -682,8 +780,7 @@ impl DualSimplex {
             if excess <= FEASIBILITY {
                 continue;
             }
-            let row = self.kernel.row(position);
-            let steepness = excess / dot(row, row).sqrt();
+            let steepness = excess / self.kernel.norm(position);
             if steepness > largest {
                 best = Some(Leaving::Column { position, at_top: value > top, excess });
                 if first_of_all {
@@ -711,40 +808,33 @@ impl DualSimplex {
         };
         let n = program.states();
         for index in self.layout.terminal..self.layout.end {
-            let id = RowId {
-                family: RowFamily::Terminal,
-                stage: program.horizon,
-                index: index - self.layout.terminal,
-            };
-            let coefficients = Some(self.terminal(program));
-            let e = self.scale[index] * residual(program, id, &self.states, coefficients);
+            let e = self.residual(program, index);
             offer(index, e, e.abs());
         }
-        let rows = program.constrained_stages * program.stage_rows;
-        let constrained = self.states[n..].chunks_exact(n).take(program.constrained_stages);
-        let states = constrained.flat_map(|z| std::iter::repeat_n(z, program.stage_rows));
-        let normals = program.stage_normals.chunks_exact(n);
-        let sides = program.stage_offsets.iter().zip(&self.scale[..rows]);
-        for (index, ((z, normal), (offset, scale))) in states.zip(normals).zip(sides).enumerate() {
-            let left = match (normal.as_array::<6>(), z.as_array::<6>()) {
-                (Some(normal), Some(z)) => (0..6).map(|i| normal[i] * z[i]).sum(),
-                _ => dot(normal, z),
-            };
-            let e = scale * (left - offset);
-            offer(index, e, e);
+        match (n, program.stage_rows) {
+            (_, 0) => {}
+            (6, 4) => self.visit_stage_rows(6, 4, &mut offer),
+            (n, q) => self.visit_stage_rows(n, q, &mut offer),
         }
         for index in self.layout.tracking..self.layout.terminal {
-            let id = self.row_id(program, index);
-            let inputs = if id.family == RowFamily::Input { Some(&self.values[..]) } else { None };
-            let e = self.scale[index] * residual(program, id, &self.states, inputs);
+            let e = self.residual(program, index);
             let wrong_side = self.is_tracking(index) && self.at_upper[index - self.layout.tracking];
             offer(index, e, if wrong_side { -e } else { e });
         }
         best
     }
 
-    fn terminal(&self, program: &HorizonProgram<'_>) -> &[f64] {
-        &self.values[program.horizon * program.inputs()..]
+    /// Residuals of the stage rows. Inlined where the sizes are constants, so that loops unroll.
+    #[inline(always)]
+    fn visit_stage_rows(&self, n: usize, q: usize, offer: &mut impl FnMut(usize, f64, f64)) {
+        let rows = self.stage_rows.chunks_exact(n * q).zip(self.stage_sides.chunks_exact(q));
+        let states = self.states[n..].chunks_exact(n);
+        for (stage, (w, (rows, sides))) in states.zip(rows).enumerate() {
+            for (i, (row, side)) in rows.chunks_exact(n).zip(sides).enumerate() {
+                let e = dot(row, w) - side;
+                offer(stage * q + i, e, e);
+            }
+        }
     }
 
     fn basic_slope(&self, column: usize) -> f64 {
@@ -831,52 +921,24 @@ fn row_scale(normal: &[f64], reach: &[f64]) -> f64 {
     }
 }
 
-/// Scaled coefficients of one state component at `stage`.
-fn unit_coefficients(
-    program: &HorizonProgram<'_>,
-    stage: usize,
-    component: usize,
-    scale: f64,
-    out: &mut [f64],
-) {
-    let m = program.inputs();
-    for (i, chunk) in out[..stage * m].chunks_exact_mut(m).enumerate() {
-        let response = program.plant.response_row(stage - 1 - i, component);
-        for (value, entry) in chunk.iter_mut().zip(response) {
-            *value = scale * entry;
-        }
-    }
-}
-
-/// Left side minus right side of a row. `columns`: the inputs for an input row, the terminal
-/// coefficients for a terminal row; `None` stands for zeros.
-fn residual(
+/// Adds `multiplier` times a row to the costates, or to the gradient directly.
+fn add_row(
     program: &HorizonProgram<'_>,
     id: RowId,
-    states: &[f64],
-    columns: Option<&[f64]>,
-) -> f64 {
+    multiplier: f64,
+    images: &[f64],
+    costates: &mut [f64],
+    gradient: &mut [f64],
+) {
     let (n, m) = (program.states(), program.inputs());
-    match id.family {
-        RowFamily::Stage => {
-            let z = &states[id.stage * n..][..n];
-            dot(program.stage_normal(id.stage, id.index), z)
-                - program.stage_offset(id.stage, id.index)
-        }
-        RowFamily::Tracking => {
-            states[id.stage * n + id.index] - program.reference(id.stage)[id.index]
-        }
-        RowFamily::Input => {
-            let normal = &program.input_normals[id.index * m..][..m];
-            let left = columns.map_or(0.0, |inputs| dot(normal, &inputs[id.stage * m..][..m]));
-            left - program.input_offsets[id.stage * program.input_rows() + id.index]
-        }
-        RowFamily::Terminal => {
-            let offset = columns.map_or(0.0, |coefficients| {
-                let generators = program.terminal_generators.chunks_exact(n);
-                generators.zip(coefficients).map(|(g, xi)| g[id.index] * xi).sum()
-            });
-            states[program.horizon * n + id.index] - program.terminal_centre[id.index] - offset
-        }
+    if id.family == RowFamily::Input {
+        add_scaled(&mut gradient[id.stage * m..][..m], &images[..m], multiplier);
+        return;
+    }
+    let own = program.plant.anchors().block_of(id.stage);
+    add_scaled(&mut costates[id.stage * n..][..n], &images[own * n..][..n], multiplier);
+    if id.family == RowFamily::Terminal {
+        let scale = inverse_or_one(program.plant.reach(id.stage)[id.index]);
+        costates[(program.horizon + 1) * n + id.index] += scale * multiplier;
     }
 }

@@ -15,6 +15,7 @@ impl DualSimplex {
         step: Candidate,
     ) {
         self.move_dual(step.length);
+        self.moved.clear();
         for i in 0..self.passed.len() {
             if let Event::Column { index, segment, up } = self.passed[i].event {
                 self.rest(index, if up { segment + 1 } else { segment });
@@ -31,9 +32,9 @@ impl DualSimplex {
                 if let (Some(segment), Place::Basic { .. }) =
                     (own_segment, self.place[self.basic[position]])
                 {
-                    self.place[self.basic[position]] = Place::Basic { segment };
+                    self.put(self.basic[position], Place::Basic { segment });
                 }
-                self.release(position, at_top, step);
+                self.release(program, position, at_top, step);
             }
         }
     }
@@ -66,42 +67,49 @@ impl DualSimplex {
         match step.event {
             Event::Flip => self.at_upper[index - self.layout.tracking] = residual > 0.0,
             Event::Column { index: column, segment, .. } => {
-                self.enter(column, segment);
+                self.enter(program, column, segment);
                 let pivot = sign * self.gradient_step[column];
                 self.kernel.border(&self.entering, &self.rho, pivot);
                 self.basic.push(column);
                 self.position[index] = u32::try_from(self.active.len()).unwrap_or(INACTIVE);
-                self.append_row(program, index, multiplier);
+                self.images.extend_from_slice(&self.leaving_images);
+                let id = self.row_id(program, index);
+                self.active.push(ActiveRow { index, id, multiplier });
             }
             Event::Row { position, at_upper } => {
                 self.kernel.replace_row(position, &self.rho);
                 self.rest_row(position, at_upper);
                 self.position[index] = u32::try_from(position).unwrap_or(INACTIVE);
-                let count = self.columns.len();
-                let right = self.right_side(program, index);
-                self.coefficients[position * count..][..count]
-                    .copy_from_slice(&self.leaving_coefficients);
-                self.active[position] = ActiveRow { index, multiplier, right };
+                let stride = self.leaving_images.len();
+                self.images[position * stride..][..stride].copy_from_slice(&self.leaving_images);
+                let id = self.row_id(program, index);
+                self.active[position] = ActiveRow { index, id, multiplier };
             }
             Event::NextSegment { .. } => unreachable!("only a leaving column has a next segment"),
         }
     }
 
     /// A basic column comes to rest at the end of its segment.
-    fn release(&mut self, position: usize, at_top: bool, step: Candidate) {
+    fn release(
+        &mut self,
+        program: &HorizonProgram<'_>,
+        position: usize,
+        at_top: bool,
+        step: Candidate,
+    ) {
         let column = self.basic[position];
         let Place::Basic { segment } = self.place[column] else { return };
         let point = if at_top { segment + 1 } else { segment };
         match step.event {
-            Event::NextSegment { segment } => self.place[column] = Place::Basic { segment },
+            Event::NextSegment { segment } => self.put(column, Place::Basic { segment }),
             Event::Column { index, segment, .. } => {
-                self.enter(index, segment);
+                self.enter(program, index, segment);
                 self.kernel.replace_column(position, &self.entering);
                 self.basic[position] = index;
-                self.come_to_rest(column, point);
+                self.rest(column, point);
             }
             Event::Row { position: row, at_upper } => {
-                self.come_to_rest(column, point);
+                self.rest(column, point);
                 self.rest_row(row, at_upper);
                 self.drop_pair(position, row);
             }
@@ -110,36 +118,23 @@ impl DualSimplex {
     }
 
     /// Makes a resting column basic; leaves M^-1 m in `entering`, with m its coefficients.
-    fn enter(&mut self, column: usize, segment: u8) {
-        let count = self.columns.len();
-        let value = self.values[column];
-        self.right_sides.clear();
-        for (i, row) in self.active.iter_mut().enumerate() {
-            let coefficient = self.coefficients[i * count + column];
-            row.right += coefficient * value;
-            self.right_sides.push(coefficient);
+    fn enter(&mut self, program: &HorizonProgram<'_>, column: usize, segment: u8) {
+        self.line.clear();
+        for i in 0..self.active.len() {
+            let id = self.active[i].id;
+            let entry = self.coefficient(program, id, self.images_of(i), column);
+            self.line.push(entry);
         }
-        self.place[column] = Place::Basic { segment };
-        self.kernel.solve(&self.right_sides, &mut self.entering);
+        self.put(column, Place::Basic { segment });
+        self.kernel.solve(&self.line, &mut self.entering);
     }
 
-    /// A basic column comes to rest at `point`.
-    fn come_to_rest(&mut self, column: usize, point: u8) {
-        self.place[column] = Place::At(point);
-        self.values[column] = 0.0;
-        self.rest(column, point);
-    }
-
-    /// A column whose contribution is on the right sides moves to `point`.
+    /// A column comes to rest at `point`.
     fn rest(&mut self, column: usize, point: u8) {
         let value = self.columns[column].points[point as usize];
-        let change = value - self.values[column];
-        let count = self.columns.len();
-        for (i, row) in self.active.iter_mut().enumerate() {
-            row.right -= self.coefficients[i * count + column] * change;
-        }
-        self.place[column] = Place::At(point);
+        self.moved.push((column, value - self.values[column]));
         self.values[column] = value;
+        self.put(column, Place::At(point));
     }
 
     fn rest_row(&mut self, position: usize, at_upper: bool) {
@@ -150,31 +145,19 @@ impl DualSimplex {
         }
     }
 
-    fn append_row(&mut self, program: &HorizonProgram<'_>, index: usize, multiplier: f64) {
-        let right = self.right_side(program, index);
-        self.coefficients.extend_from_slice(&self.leaving_coefficients);
-        self.active.push(ActiveRow { index, multiplier, right });
-    }
-
-    /// Right side of the row in `leaving_coefficients`.
-    fn right_side(&self, program: &HorizonProgram<'_>, index: usize) -> f64 {
-        let resting = self.resting_contribution(&self.leaving_coefficients);
-        -self.free_residual(program, index) - resting
-    }
-
     /// Drops a basic column and an active row from the lists and the kernel.
     pub(super) fn drop_pair(&mut self, column: usize, row: usize) {
         self.kernel.shrink(column, row);
         self.position[self.active[row].index] = INACTIVE;
         self.basic.swap_remove(column);
         self.active.swap_remove(row);
-        let count = self.columns.len();
+        let stride = self.leaving_images.len();
         let last = self.active.len();
         if row < last {
-            self.coefficients.copy_within(last * count..(last + 1) * count, row * count);
+            self.images.copy_within(last * stride..(last + 1) * stride, row * stride);
             self.position[self.active[row].index] = u32::try_from(row).unwrap_or(INACTIVE);
         }
-        self.coefficients.truncate(last * count);
+        self.images.truncate(last * stride);
     }
 
     /// The direction as a Farkas ray.

@@ -1,6 +1,8 @@
 //! The dual step: its direction, and how far it goes.
 
-use super::{Column, DualSimplex, FEASIBILITY, HorizonProgram, Leaving, Place};
+use std::{cmp::Ordering, collections::BinaryHeap};
+
+use super::{ActiveRow, DualSimplex, FEASIBILITY, HorizonProgram, Leaving, Place, add_row};
 
 /// Entries below this share of the step's largest are rounding of zeros: no breakpoints. A ray
 /// found without them is checked with them, and so is an optimum.
@@ -48,36 +50,29 @@ pub(super) enum Outcome {
 impl DualSimplex {
     /// Change of multipliers and gradient for a unit dual step away from the violation.
     pub(super) fn direction(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) {
-        let count = self.columns.len();
         match leaving {
             Leaving::Column { position, at_top, .. } => {
                 // Above its top, a column needs a gradient below minus its slope.
                 let sign = if at_top { -1.0 } else { 1.0 };
                 self.multiplier_step.clear();
                 self.multiplier_step.extend(self.kernel.row(position).iter().map(|x| sign * x));
-                self.gradient_step.fill(0.0);
             }
             Leaving::Row { index, residual } => {
                 let sign = residual.signum();
-                let mut line = std::mem::take(&mut self.leaving_coefficients);
-                self.row_coefficients(program, index, &mut line);
-                let in_basic: Vec<f64> = self.basic.iter().map(|&c| line[c]).collect();
-                let mut rho = std::mem::take(&mut self.rho);
-                self.kernel.solve_transposed(&in_basic, &mut rho);
+                self.load_images(program, index);
+                let id = self.row_id(program, index);
+                let mut line = std::mem::take(&mut self.line);
+                let images = &self.leaving_images;
+                let entry = |&column: &usize| self.coefficient(program, id, images, column);
+                line.clear();
+                line.extend(self.basic.iter().map(entry));
+                self.kernel.solve_transposed(&line, &mut self.rho);
+                self.line = line;
                 self.multiplier_step.clear();
-                self.multiplier_step.extend(rho.iter().map(|x| -sign * x));
-                for (step, coefficient) in self.gradient_step.iter_mut().zip(&line) {
-                    *step = sign * coefficient;
-                }
-                self.leaving_coefficients = line;
-                self.rho = rho;
+                self.multiplier_step.extend(self.rho.iter().map(|x| -sign * x));
             }
         }
-        for (line, weight) in self.coefficients.chunks_exact(count).zip(&self.multiplier_step) {
-            for (step, coefficient) in self.gradient_step.iter_mut().zip(line) {
-                *step += weight * coefficient;
-            }
-        }
+        self.load_gradient_step(program, leaving);
         // Exact on the basic columns by construction.
         for &column in &self.basic {
             self.gradient_step[column] = 0.0;
@@ -87,11 +82,30 @@ impl DualSimplex {
         }
     }
 
+    fn load_gradient_step(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) {
+        let mut step = std::mem::take(&mut self.gradient_step);
+        self.start_gradient(program, &mut step);
+        for i in 0..self.active.len() {
+            let ActiveRow { id, .. } = self.active[i];
+            let images = &self.images[i * self.leaving_images.len()..];
+            let weight = self.multiplier_step[i];
+            add_row(program, id, weight, images, &mut self.costates, &mut step);
+        }
+        if let Leaving::Row { index, residual } = leaving {
+            let (id, images) = (self.row_id(program, index), &self.leaving_images);
+            add_row(program, id, residual.signum(), images, &mut self.costates, &mut step);
+        }
+        self.finish_gradient(program, &mut step);
+        self.gradient_step = step;
+    }
+
     /// Long-step ratio test: goes on past breakpoints while the dual objective rises.
     pub(super) fn ratio_test(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) -> Outcome {
         let largest = self.gradient_step.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
-        self.load_lengths(NOISE * largest);
-        self.load_events(program, leaving);
+        self.candidates.clear();
+        let end = self.load_events(program, leaving);
+        self.load_columns(NOISE * largest, end);
+        let mut nearest_first = BinaryHeap::from(std::mem::take(&mut self.candidates));
         let mut slope = match leaving {
             Leaving::Column { excess, .. } => excess,
             Leaving::Row { residual, .. } => residual.abs(),
@@ -99,22 +113,24 @@ impl DualSimplex {
         let (mut travelled, mut gain) = (0.0, 0.0);
         self.passed.clear();
         let chosen = loop {
-            let Some(mut candidate) = self.take_nearest() else {
-                return Outcome::Unbounded;
+            let Some(mut candidate) = take_nearest(&mut nearest_first, &mut self.tied) else {
+                break None;
             };
             gain += slope * (candidate.length - travelled);
             travelled = candidate.length;
             candidate.gain = gain;
-            let Some(drop) = self.slope_drop(leaving, candidate) else { break candidate };
+            let Some(drop) = self.slope_drop(leaving, candidate) else { break Some(candidate) };
             slope -= drop;
             // The slope is the violation that is left: what counts as met needs no further step,
             // least of all at the very edge of what can be reached.
             if slope <= FEASIBILITY {
-                break candidate;
+                break Some(candidate);
             }
-            self.queue_next(candidate);
+            nearest_first.extend(self.next_of(candidate));
             self.passed.push(candidate);
         };
+        self.candidates = nearest_first.into_vec();
+        let Some(chosen) = chosen else { return Outcome::Unbounded };
         if chosen.size < SOUND_PIVOT * largest {
             // A shorter step with a sound pivot is still a dual ascent.
             let sound = |candidate: &Candidate| candidate.size >= SOUND_PIVOT * largest;
@@ -145,25 +161,9 @@ impl DualSimplex {
         }
     }
 
-    /// Step lengths to the first breakpoint of each resting column; infinite if there is none.
-    fn load_lengths(&mut self, noise: f64) {
-        self.lengths.clear();
-        let columns = self.columns.iter().zip(&self.place);
-        let gradients = self.gradient.iter().zip(&self.gradient_step);
-        self.lengths.extend(columns.zip(gradients).map(|((column, place), (gradient, step))| {
-            match *place {
-                Place::At(point) if step.abs() > noise => {
-                    let target = column.next_gradient(point, *step);
-                    ((target - gradient) / step).max(0.0)
-                }
-                _ => f64::INFINITY,
-            }
-        }));
-    }
-
-    /// What can end the step besides resting columns.
-    fn load_events(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) {
-        self.events.clear();
+    /// What can end the step besides resting columns; returns where the first of it does.
+    fn load_events(&mut self, program: &HorizonProgram<'_>, leaving: Leaving) -> f64 {
+        let mut end = f64::INFINITY;
         let row_noise =
             NOISE * self.multiplier_step.iter().fold(0.0_f64, |a, step| a.max(step.abs()));
         for (position, row) in self.active.iter().enumerate() {
@@ -175,8 +175,9 @@ impl DualSimplex {
             let bound = if step > 0.0 { upper } else { lower };
             if bound.is_finite() {
                 let length = ((bound - row.multiplier) / step).max(0.0);
+                end = end.min(length);
                 let event = Event::Row { position, at_upper: step > 0.0 };
-                self.events.push(Candidate { length, size: step.abs(), gain: 0.0, event });
+                self.candidates.push(Candidate { length, size: step.abs(), gain: 0.0, event });
             }
         }
         match leaving {
@@ -184,99 +185,97 @@ impl DualSimplex {
                 let (lower, upper) = self.multiplier_range(program, index);
                 if lower.is_finite() && upper.is_finite() {
                     let (length, event) = (upper - lower, Event::Flip);
-                    self.events.push(Candidate { length, size: 1.0, gain: 0.0, event });
+                    end = end.min(length);
+                    self.candidates.push(Candidate { length, size: 1.0, gain: 0.0, event });
                 }
             }
             Leaving::Column { position, at_top, .. } => {
                 let index = self.basic[position];
-                let Place::Basic { segment } = self.place[index] else { return };
+                let Place::Basic { segment } = self.place[index] else { return end };
                 let column = &self.columns[index];
                 let next = if at_top { segment.checked_add(1) } else { segment.checked_sub(1) };
                 if let Some(next) = next.filter(|&s| s < column.last()) {
                     let change = column.slopes[next as usize] - column.slopes[segment as usize];
                     let (length, event) = (change.abs(), Event::NextSegment { segment: next });
-                    self.events.push(Candidate { length, size: 1.0, gain: 0.0, event });
+                    self.candidates.push(Candidate { length, size: 1.0, gain: 0.0, event });
+                }
+            }
+        }
+        end
+    }
+
+    /// The first breakpoints of the resting columns, up to the `end` of the step.
+    fn load_columns(&mut self, noise: f64, end: f64) {
+        let end = (end * (1.0 + TIE)).min(f64::MAX);
+        let gradients = self.gradient.iter().zip(&self.gradient_step);
+        for (index, ((gradient, step), limits)) in gradients.zip(&self.limits).enumerate() {
+            if step.abs() > noise {
+                let length = (limits[usize::from(*step > 0.0)] - gradient) / step;
+                if length <= end
+                    && let Place::At(point) = self.place[index]
+                {
+                    self.candidates.push(Candidate::column(index, point, *step, length));
                 }
             }
         }
     }
 
     /// After a column has passed one breakpoint it may meet another.
-    fn queue_next(&mut self, passed: Candidate) {
-        let Event::Column { index, segment, up } = passed.event else { return };
-        let step = self.gradient_step[index];
+    fn next_of(&self, passed: Candidate) -> Option<Candidate> {
+        let Event::Column { index, segment, up } = passed.event else { return None };
         let point = if up { segment + 1 } else { segment };
-        let target = self.columns[index].next_gradient(point, step);
-        self.lengths[index] = ((target - self.gradient[index]) / step).max(0.0);
+        let (gradient, step) = (self.gradient[index], self.gradient_step[index]);
+        let limits = self.columns[index].limits(point);
+        let length = (limits[usize::from(step > 0.0)] - gradient) / step;
+        (length < f64::INFINITY).then(|| Candidate::column(index, point, step, length))
     }
+}
 
-    /// The nearest candidate; among equals the one with the largest pivot.
-    fn take_nearest(&mut self) -> Option<Candidate> {
-        let mut nearest: Option<usize> = None;
-        let (mut length, mut size) = (f64::INFINITY, 0.0);
-        let closer = |offered: f64, offered_size: f64, length: f64, size: f64| {
-            offered < length * (1.0 - TIE)
-                || (offered <= length * (1.0 + TIE) && offered_size > size)
-        };
-        for (i, &offered) in self.lengths.iter().enumerate() {
-            if offered <= length * (1.0 + TIE) && offered < f64::INFINITY {
-                let offered_size = self.gradient_step[i].abs();
-                if closer(offered, offered_size, length, size) {
-                    nearest = Some(i);
-                    (length, size) = (offered, offered_size);
-                }
-            }
-        }
-        let mut event = None;
-        for (i, candidate) in self.events.iter().enumerate() {
-            if closer(candidate.length, candidate.size, length, size) {
-                event = Some(i);
-                (length, size) = (candidate.length, candidate.size);
-            }
-        }
-        if let Some(i) = event {
-            return Some(self.events.swap_remove(i));
-        }
-        let index = nearest?;
-        self.lengths[index] = f64::INFINITY;
-        let up = self.gradient_step[index] < 0.0;
-        let segment = self.segment_ahead(index, up);
+impl Candidate {
+    /// A column that rests at `point` leaves it.
+    fn column(index: usize, point: u8, step: f64, length: f64) -> Self {
+        let up = step < 0.0;
+        let segment = if up { point } else { point - 1 };
         let event = Event::Column { index, segment, up };
-        Some(Candidate { length, size, gain: 0.0, event })
-    }
-
-    /// The segment that a resting column meets first, counting what it has passed in this step.
-    fn segment_ahead(&self, index: usize, up: bool) -> u8 {
-        let passed = self.passed.iter().rev().find_map(|candidate| match candidate.event {
-            Event::Column { index: other, segment, .. } if other == index => Some(segment),
-            _ => None,
-        });
-        let point = match (passed, self.place[index]) {
-            (Some(segment), _) => {
-                if up {
-                    segment + 1
-                } else {
-                    segment
-                }
-            }
-            (None, Place::At(point)) => point,
-            (None, Place::Basic { segment }) => segment,
-        };
-        if up { point } else { point.saturating_sub(1) }
+        Self { length: length.max(0.0), size: step.abs(), gain: 0.0, event }
     }
 }
 
-impl Column {
-    /// The gradient at which the column leaves breakpoint `point` when the gradient moves in the
-    /// direction of `step`; infinite if it never does.
-    fn next_gradient(&self, point: u8, step: f64) -> f64 {
-        // A falling gradient pulls the column up.
-        if step < 0.0 {
-            if point < self.last() { -self.slopes[point as usize] } else { f64::NEG_INFINITY }
-        } else if point > 0 {
-            -self.slopes[point as usize - 1]
-        } else {
-            f64::INFINITY
-        }
+/// The nearest candidate; among equals the one with the largest pivot.
+fn take_nearest(
+    nearest_first: &mut BinaryHeap<Candidate>,
+    tied: &mut Vec<Candidate>,
+) -> Option<Candidate> {
+    let mut best = nearest_first.pop()?;
+    tied.clear();
+    while let Some(other) =
+        nearest_first.peek().filter(|other| other.length <= best.length * (1.0 + TIE))
+    {
+        let other = *other;
+        nearest_first.pop();
+        tied.push(if other.size > best.size { std::mem::replace(&mut best, other) } else { other });
+    }
+    nearest_first.extend(tied.drain(..));
+    Some(best)
+}
+
+/// The nearest is the greatest, as a heap wants it; equals in a fixed order.
+impl Ord for Candidate {
+    fn cmp(&self, other: &Self) -> Ordering {
+        other.length.total_cmp(&self.length).then_with(|| self.size.total_cmp(&other.size))
     }
 }
+
+impl PartialOrd for Candidate {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Candidate {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other) == Ordering::Equal
+    }
+}
+
+impl Eq for Candidate {}
