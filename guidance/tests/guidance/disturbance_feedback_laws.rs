@@ -432,7 +432,8 @@ fn flight_outside_the_assumed_set_is_reported_and_clipped() {
     assert!(burn.delta_v_m_s.amax() <= limit);
     // The wrong time and the wrong state are refused.
     assert!(matches!(fly(&start, off, 5.0), Err(StepError::Measurement(_))));
-    let other = planned(&Problem { instants: equal_time(4, 9_000.0), ..prisma(9_000.0) });
+    let four = Problem { instants: equal_time(4, 9e3), delta_v_max_m_s: 3.0, ..prisma(9e3) };
+    let other = planned(&four);
     let measurement = Measurement { state: off, elapsed: None };
     let mut flight = first.next;
     for _ in 0..5 {
