@@ -181,7 +181,8 @@ impl LinearModel {
         answers
     }
 
-    /// H G_i P_i (m x 6): what disturbance `i` does to the last state, unanswered; the ball's image.
+    /// H G_i P_i (m x 6): what disturbance `i` does to the last state if nothing answers it, as the
+    /// image of the unit ball.
     pub(super) fn unanswered(&self, i: usize) -> DMatrix<f64> {
         let to_end = product(&self.metric, &self.to_end[i + 1]);
         product(&to_end, self.disturbances[i].root())
@@ -205,7 +206,8 @@ impl LinearModel {
         self.unreachable_share().0 <= REACH_CUT_OFF
     }
 
-    /// Least `delta_v_max_m_s` for which a plan exists, with the ray that proves it; `None` if none would do.
+    /// Least `delta_v_max_m_s` for which a plan exists, with the ray that proves it; `None` if none
+    /// would do.
     pub(super) fn least_limit(&self) -> Option<(f64, Vec<f64>)> {
         if !self.is_reachable() {
             return None;
@@ -213,8 +215,9 @@ impl LinearModel {
         least_limit(&self.burn_map(), self.shortfall().as_slice())
     }
 
-    /// A lower bound on the objective of every plan: no gains leave less of disturbance i than the part of H G_i P_i outside the range
-    /// of the later burns, and no burns cost less than the linear program without corrections.
+    /// A lower bound on the objective of every plan: no gains leave less of disturbance i than the
+    /// part of H G_i P_i outside the range of the later burns, and no burns cost less than the linear
+    /// program without corrections.
     #[must_use]
     pub fn lower_bound(&self) -> LowerBound {
         let trace_shares: Vec<f64> = (0..self.burns())
