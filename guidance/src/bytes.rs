@@ -44,6 +44,10 @@ impl Writer {
         self.bytes.extend((count as u64).to_le_bytes());
     }
 
+    pub(crate) fn integer(&mut self, value: i64) {
+        self.bytes.extend(value.to_le_bytes());
+    }
+
     /// Counts of two bytes each, for indices that travel often; larger ones are saturated, and
     /// readers check what indices they get.
     pub(crate) fn small_counts(&mut self, counts: &[usize]) {
@@ -127,6 +131,12 @@ impl<'a> Reader<'a> {
             .ok_or_else(|| self.fault("count too large"))
     }
 
+    pub(crate) fn integer(&mut self) -> Result<i64, DecodeError> {
+        let mut raw = [0; 8];
+        raw.copy_from_slice(self.take(8)?);
+        Ok(i64::from_le_bytes(raw))
+    }
+
     pub(crate) fn small_counts(&mut self) -> Result<Vec<usize>, DecodeError> {
         let mut next = || -> Result<usize, DecodeError> {
             let mut raw = [0; 2];
@@ -187,6 +197,20 @@ impl<'a> Reader<'a> {
     }
 }
 
+/// CRC-32 as in IEEE 802.3 and ZIP: reflected polynomial 0xEDB88320, all ones before and after.
+/// Finds every change of one bit, and every burst of up to 32.
+pub(crate) fn crc32(bytes: &[u8]) -> u32 {
+    let mut register = u32::MAX;
+    for &byte in bytes {
+        register ^= u32::from(byte);
+        for _ in 0..8 {
+            let carry = register & 1;
+            register = (register >> 1) ^ (0xEDB8_8320 * carry);
+        }
+    }
+    !register
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -216,6 +240,11 @@ mod tests {
         for length in 1..bytes.len() {
             assert!(read(&bytes[..length]).is_err(), "{length} of {} bytes", bytes.len());
         }
+    }
+
+    #[test]
+    fn checksum_has_the_standards_check_value() {
+        assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
     }
 
     #[test]
