@@ -1,8 +1,10 @@
 //! Convex sets that speak by their support function.
 
+mod ellipsoid;
 mod polytope;
 mod zonotope;
 
+pub use ellipsoid::{Ellipsoid, EllipsoidError, OuterSum};
 pub use polytope::Polytope;
 pub use zonotope::{Zonotope, ZonotopeGauge, ZonotopeMeasure};
 
