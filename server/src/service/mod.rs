@@ -361,9 +361,7 @@ impl Service {
             Controller::Artifact(id) => {
                 self.load(Shelf::Artifacts, id, call).await.map(Found::Controller)
             }
-            Controller::Plan(id) => {
-                self.load(Shelf::Plans, id, call).await.map(Found::Controller)
-            }
+            Controller::Plan(id) => self.load(Shelf::Plans, id, call).await.map(Found::Controller),
             Controller::Problem(problem) => {
                 let id = record::problem_id(&problem);
                 match self.obtain(id, problem, call).await? {
@@ -521,11 +519,7 @@ fn kept_plan(loaded: Loaded) -> KeptPlanAnswer {
 }
 
 /// Reads and checks what stands on a shelf under `id`.
-fn stored(
-    store: &dyn RecordStore,
-    shelf: Shelf,
-    id: ArtifactId,
-) -> Result<Option<Loaded>, Error> {
+fn stored(store: &dyn RecordStore, shelf: Shelf, id: ArtifactId) -> Result<Option<Loaded>, Error> {
     let Some(record) = store.get(shelf, &id.0)? else { return Ok(None) };
     match record::decode(shelf, id, &record) {
         Ok((artifact, bytes)) => Ok(Some(loaded(id, Arc::new(artifact), bytes))),
