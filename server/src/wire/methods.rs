@@ -426,6 +426,14 @@ impl PlanVerdict {
         self.plan().map(|plan| &plan.certificate)
     }
 
+    /// Whether there is no plan.
+    pub(crate) fn is_infeasible(&self) -> bool {
+        match self {
+            Self::VariableHorizon(_) => self.plan().is_none(),
+            Self::DisturbanceFeedback => false,
+        }
+    }
+
     /// What the solvers did; unknown without a plan.
     pub(crate) fn work(&self) -> SolverWork {
         self.plan().map(|plan| work(&plan.diagnostics)).unwrap_or_default()

@@ -208,7 +208,7 @@ mod tests {
     fn epoch_scales_differ_by_what_they_should() {
         let text = "2027-03-01T12:00:00.000";
         let tai = moment(text, TimeSystem::Tai);
-        let later = |system, seconds| {
+        let later = |system, seconds: f64| {
             let difference = seconds_between(&tai, &moment(text, system));
             assert!((difference - seconds).abs() < 1e-9, "{system:?} {difference}");
         };

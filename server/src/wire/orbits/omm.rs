@@ -100,7 +100,7 @@ impl<'a> Omm<'a> {
         let mean_motion_dot = rate("MEAN_MOTION_DOT");
         let mean_motion_ddot = rate("MEAN_MOTION_DDOT");
         self.refuse_unknown();
-        (version?, centre?, frame?, system?, theory?);
+        version.and(centre).and(frame).and(system).and(theory)?;
         ephemeris.unwrap_or(Some(()))?;
         Some(Elements {
             object_name,
