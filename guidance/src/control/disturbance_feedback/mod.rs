@@ -1,6 +1,7 @@
 //! Fixed-time rendezvous plans with disturbance feedback.
 
 mod answer;
+mod coast;
 mod conic;
 mod design;
 mod encoding;
@@ -14,6 +15,7 @@ mod state;
 pub use answer::{
     Arrival, BurnCommand, Diagnostics, Measurement, RealisedDisturbance, Step, Verdict,
 };
+pub use coast::{Coast, CoastState};
 pub use model::{LinearModel, LowerBound};
 pub use outcome::{ArrivalSet, BurnBounds, Outcome, PlanCertificate, PlannedState};
 pub use plan::{Gain, Origin, Plan};
