@@ -109,3 +109,61 @@ impl Coast {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::{super::plan as make_plan, super::*, *};
+    use crate::{
+        budget::Budget,
+        sets::{Ellipsoid, OuterSum},
+        units::Distance,
+    };
+
+    /// Prisma in 5 hours with 6 instants [Deaconu2014, sec. V].
+    fn prisma() -> Problem {
+        let state = |position: [f64; 3], velocity: [f64; 3]| RelativeState {
+            position_m: InFrame::new(position.into()),
+            velocity_m_s: InFrame::new(velocity.into()),
+        };
+        let radii = [0.02, 0.02, 0.02, 2e-3, 2e-3, 2e-3];
+        let a = Distance::from_metres(7.011e6);
+        Problem {
+            orbit: KeplerOrbit::new(a, 0.004, Angle::from_radians(0.0), None).unwrap(),
+            epoch: None,
+            initial: state([1e4, 0.0, 0.0], [0.0; 3]),
+            target_state: state([330.0, 0.0, 30.0], [0.0, 0.0, -0.0158]),
+            instants: Instants::EqualTime { count: 6, duration: Seconds::from_seconds(18_000.0) },
+            delta_v_max_m_s: 0.26,
+            navigation_errors: vec![Ellipsoid::from_semi_axes(&radii).unwrap()],
+            outer_sum: OuterSum::MinVolume,
+            metric: ArrivalMetric::Position,
+            fuel_weight: 1.0,
+            effort_weight: 1e-2,
+            compare_open_loop: false,
+        }
+    }
+
+    #[test]
+    fn coast_ends_where_the_plan_says_and_never_outside_its_bound() {
+        let plan = make_plan(&prisma(), Budget::UNLIMITED).unwrap();
+        let states = &plan.outcome().states;
+        for k in 0..5 {
+            let coast = plan.coast(k).unwrap();
+            assert_eq!((coast.start(), coast.end()), (states[k].elapsed, states[k + 1].elapsed));
+            let end = coast.at(coast.end());
+            let (found, planned) = (physical_values(&end.state), &states[k + 1]);
+            let miss = found - physical_values(&planned.state);
+            // Rounding of 10 km carried on for an hour.
+            assert!(miss.amax() < 1e-7, "{k}: {miss}");
+            // The plan's bound holds a further navigation error, and is taken over other sums.
+            let trace = |shape: &DMatrix<f64>| (0..3).map(|i| shape[(i, i)]).sum::<f64>();
+            let ratio = (trace(&end.outer_shape) / trace(&planned.outer_shape)).sqrt();
+            assert!((0.5..1.1).contains(&ratio), "{k}: {ratio}");
+        }
+        assert!(plan.coast(5).is_none());
+        // Before any correction: the navigation error itself.
+        let start = plan.coast(0).unwrap().at(Seconds::from_seconds(0.0)).outer_shape;
+        let error = prisma().navigation_errors[0].shape().clone();
+        assert!((start - &error).amax() < 1e-12 * error.amax());
+    }
+}
