@@ -13,6 +13,7 @@
 mod compute;
 mod config;
 mod node;
+pub mod offline;
 mod service;
 mod store;
 mod telemetry;

@@ -134,7 +134,7 @@ impl Parse for ElapsedAndState {
     }
 }
 
-fn relative_state(
+pub(super) fn relative_state(
     message: &v1::RelativeState,
     path: Path<'_>,
     door: &mut Door,
@@ -369,6 +369,27 @@ fn render_family(family: ConstraintFamily) -> i32 {
     family.into()
 }
 
+/// What a method's amounts of infeasibility are measured in.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Units {
+    /// Metres in one unit of a state constraint, for spacecraft plants.
+    position_unit_m: Option<f64>,
+    /// The limit of an impulse that input constraints are measured in, m/s.
+    impulse_limit_m_s: Option<f64>,
+}
+
+impl Units {
+    /// Inputs are impulses, and amounts are shares of their limit.
+    pub(super) fn impulses(limit_m_s: f64) -> Self {
+        Self { position_unit_m: None, impulse_limit_m_s: Some(limit_m_s) }
+    }
+
+    /// Scaled amounts; `position_unit_m` is metres in one unit of position.
+    pub(super) fn scaled(position_unit_m: Option<f64>) -> Self {
+        Self { position_unit_m, impulse_limit_m_s: None }
+    }
+}
+
 /// Only state constraints of a spacecraft plant are half-spaces of position, hence metres.
 fn in_metres(family: ConstraintFamily, amount: f64, position_unit_m: Option<f64>) -> Option<f64> {
     match family {
@@ -414,22 +435,24 @@ pub(super) fn render_certificate(
     }
 }
 
-/// `position_unit_m`: metres in one unit of scaled position, for spacecraft plants.
-pub(super) fn render_infeasible(
-    infeasibility: &Infeasibility,
-    position_unit_m: Option<f64>,
-) -> v1::Infeasible {
+/// Writes why there is no answer.
+pub(super) fn render_infeasible(infeasibility: &Infeasibility, units: Units) -> v1::Infeasible {
     let row = |r: &control::ProofRow| v1::ConstraintRow {
         family: render_family(r.family),
         stage: count(r.stage),
         row: count(r.row),
         weight: r.weight,
     };
-    let relaxation = |r: &control::Relaxation| v1::Relaxation {
-        family: render_family(r.family),
-        horizon: count(r.horizon),
-        amount_nd: r.amount,
-        amount_m: in_metres(r.family, r.amount, position_unit_m),
+    let relaxation = |r: &control::Relaxation| {
+        let limit = units.impulse_limit_m_s.filter(|_| r.family == ConstraintFamily::Input);
+        v1::Relaxation {
+            family: render_family(r.family),
+            horizon: count(r.horizon),
+            amount_nd: r.amount,
+            amount_m: in_metres(r.family, r.amount, units.position_unit_m),
+            amount_m_s: limit.map(|limit| r.amount * limit),
+            limit_m_s: limit.map(|limit| (1.0 + r.amount) * limit),
+        }
     };
     v1::Infeasible {
         reason: infeasibility.reason.clone(),

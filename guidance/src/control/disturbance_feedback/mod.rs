@@ -70,6 +70,7 @@
 //! \[Deaconu2014\], \[YamanakaAnkersen2002\], \[Ros2002\].
 
 mod answer;
+mod coast;
 mod conic;
 mod design;
 mod encoding;
@@ -83,6 +84,7 @@ mod state;
 pub use answer::{
     Arrival, BurnCommand, Diagnostics, Measurement, RealisedDisturbance, Step, Verdict,
 };
+pub use coast::{Coast, CoastState};
 pub use model::{LinearModel, LowerBound};
 pub use outcome::{ArrivalSet, BurnBounds, Outcome, PlanCertificate, PlannedState};
 pub use plan::{Gain, Origin, Plan};

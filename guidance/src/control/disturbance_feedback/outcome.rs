@@ -122,7 +122,7 @@ pub(super) const GAP_CLOSED: f64 = 1e-6;
 pub(super) const GAP_ROUNDING: f64 = 1e-9;
 
 /// M_i P_i (6 x 6) of every disturbance that has acted before one instant.
-type Effects = Vec<DMatrix<f64>>;
+pub(super) type Effects = Vec<DMatrix<f64>>;
 
 impl Outcome {
     /// Recomputes everything from a model, burns (m/s) and gains.
@@ -254,23 +254,36 @@ fn planned_states(
 }
 
 fn advanced_effects(model: &LinearModel, k: usize, effects: &Effects, gains: &[Gain]) -> Effects {
-    let mut advanced: Effects = effects
-        .iter()
-        .enumerate()
-        .map(|(i, effect)| {
-            let mut after = effect.clone();
-            let correction = product(&gain(gains, k, i).matrix, model.disturbances[i].root());
-            for row in 0..3 {
-                for column in 0..6 {
-                    after[(3 + row, column)] +=
-                        model.scales[k].velocity_scale_s * correction[(row, column)];
-                }
-            }
-            product(&model.steps[k], &after)
-        })
-        .collect();
+    let corrected = corrected_effects(model, k, effects, gains);
+    let mut advanced: Effects =
+        corrected.iter().map(|after| product(&model.steps[k], after)).collect();
     advanced.push(model.disturbances[k].root().clone());
     advanced
+}
+
+/// The effects just after burn k: each with its correction.
+fn corrected_effects(model: &LinearModel, k: usize, effects: &Effects, gains: &[Gain]) -> Effects {
+    let corrected = |(i, effect): (usize, &DMatrix<f64>)| {
+        let mut after = effect.clone();
+        let correction = product(&gain(gains, k, i).matrix, model.disturbances[i].root());
+        for row in 0..3 {
+            for column in 0..6 {
+                after[(3 + row, column)] +=
+                    model.scales[k].velocity_scale_s * correction[(row, column)];
+            }
+        }
+        after
+    };
+    effects.iter().enumerate().map(corrected).collect()
+}
+
+/// The effects just after burn k.
+pub(super) fn effects_after_burn(model: &LinearModel, k: usize, gains: &[Gain]) -> Effects {
+    let mut effects = Effects::new();
+    for earlier in 0..k {
+        effects = advanced_effects(model, earlier, &effects, gains);
+    }
+    corrected_effects(model, k, &effects, gains)
 }
 
 /// Gains are ordered by burn, then by disturbance: burn k has k of them.
@@ -298,7 +311,7 @@ fn outer_shape(
 
 /// sum_i E_i E_i' / tau_i with tau_i = size_i / sum of sizes: contains the sum of the ellipsoids
 /// E_i ball, and of all such the least trace in the measure that made the sizes.
-fn sum_shape(effects: &[&DMatrix<f64>], sizes: &[f64]) -> DMatrix<f64> {
+pub(super) fn sum_shape(effects: &[&DMatrix<f64>], sizes: &[f64]) -> DMatrix<f64> {
     let total: f64 = sizes.iter().sum();
     let rows = effects[0].nrows();
     let mut shape = DMatrix::zeros(rows, rows);

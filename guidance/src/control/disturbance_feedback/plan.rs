@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector, Vector3};
 
 use super::{
-    ArrivalSet, Outcome, Problem, encoding,
+    ArrivalSet, Coast, Outcome, Problem, encoding,
     model::LinearModel,
     outcome::{gain_count, physical_values},
 };
@@ -88,6 +88,20 @@ impl Plan {
 
     pub(super) fn model(&self) -> &LinearModel {
         &self.model
+    }
+
+    /// The coast after burn `k`, until the next instant; `None` if there is no such burn.
+    #[must_use]
+    pub fn coast(&self, k: usize) -> Option<Coast> {
+        let burn = self.burns.get(k)?;
+        Some(Coast::new(
+            &self.problem.orbit,
+            &self.model,
+            k,
+            burn,
+            &self.outcome.states,
+            &self.gains,
+        ))
     }
 
     /// A plan made elsewhere: burns and gains, checked by the certificate.
