@@ -12,18 +12,21 @@ use vbar_client::{
     Client, Options,
     v1::{ComputePlanRequest, Measurement, StepRequest},
 };
-use vbar_simulator::{Mission, SchemeChoice};
+use vbar_simulator::{Mission, MissionFile, SchemeChoice};
 
 use crate::{
     failure::Failure,
     json,
+    plans::{self, PlanOptions},
     session::{NodeArguments, Session},
 };
 
 /// Largest request that is read.
 const REQUEST_BYTES_MAX: u64 = 64 << 20;
 
-/// The plan starts at the mission's own first state, or at the one given.
+/// For closed-loop missions the plan starts at the mission's own first state, or at the one given,
+/// and is printed as JSON. For missions with disturbance feedback it is printed as a table, with
+/// its proof, and can be exported.
 #[derive(Debug, Args)]
 pub(crate) struct PlanArguments {
     /// Mission file, such as simulator/missions/envisat.json
@@ -39,6 +42,8 @@ pub(crate) struct PlanArguments {
     /// mission draws its first state by chance
     #[arg(long, value_name = "FILE")]
     initial: Option<PathBuf>,
+    #[command(flatten)]
+    options: PlanOptions,
 }
 
 /// Everything the decision needs is in the request.
@@ -76,7 +81,20 @@ pub(crate) struct HealthArguments {
 }
 
 pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
-    let mission = load(&arguments.mission, arguments.scheme)?;
+    let mission = match file(&arguments.mission)? {
+        MissionFile::DisturbanceFeedback(mission) => {
+            let foreign = [
+                ("--scheme", arguments.scheme.is_some()),
+                ("--initial", arguments.initial.is_some()),
+            ];
+            refuse(foreign, "a mission with disturbance feedback")?;
+            return plans::plan(&mission, &arguments.node, &arguments.options).await;
+        }
+        MissionFile::VariableHorizon(mission) => under(*mission, arguments.scheme)?,
+    };
+    if let Some(name) = arguments.options.given() {
+        return Err(Failure::usage(format!("{name} is not for a closed-loop mission")));
+    }
     let initial: Measurement = match &arguments.initial {
         Some(path) => json::parse(&read(path)?)?,
         None => mission.fixed_start().ok_or_else(|| {
@@ -103,9 +121,16 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
 }
 
 pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
-    let mission = load(&arguments.mission, arguments.scheme)?;
+    let problem = match file(&arguments.mission)? {
+        MissionFile::DisturbanceFeedback(mission) => {
+            let foreign = [("--scheme", arguments.scheme.is_some())];
+            refuse(foreign, "a mission with disturbance feedback")?;
+            mission.problem
+        }
+        MissionFile::VariableHorizon(mission) => under(*mission, arguments.scheme)?.problem,
+    };
     let session = Session::open(&arguments.node).await?;
-    let answer = session.client.precompute(mission.problem).await;
+    let answer = session.client.precompute(problem).await;
     session.close().await;
     json::print(&json::render(&answer?)?)
 }
@@ -121,8 +146,22 @@ pub(crate) async fn health(arguments: HealthArguments) -> Result<(), Failure> {
     }
 }
 
-fn load(path: &Path, scheme: Option<SchemeChoice>) -> Result<Mission, Failure> {
-    let mission = Mission::load(path).map_err(|fault| Failure::data(fault.to_string()))?;
+pub(crate) fn file(path: &Path) -> Result<MissionFile, Failure> {
+    MissionFile::load(path).map_err(|fault| Failure::data(fault.to_string()))
+}
+
+/// Options that were given although they mean nothing for this kind of mission are named.
+pub(crate) fn refuse(
+    options: impl IntoIterator<Item = (&'static str, bool)>,
+    mission: &str,
+) -> Result<(), Failure> {
+    match options.into_iter().find(|(_, given)| *given) {
+        None => Ok(()),
+        Some((name, _)) => Err(Failure::usage(format!("{name} is not for {mission}"))),
+    }
+}
+
+fn under(mission: Mission, scheme: Option<SchemeChoice>) -> Result<Mission, Failure> {
     match scheme {
         None => Ok(mission),
         Some(SchemeChoice::All) => Err(Failure::usage("--scheme: name one")),

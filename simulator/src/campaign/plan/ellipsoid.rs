@@ -1,6 +1,7 @@
-//! The arrival set as an answer gives it: `{d : d' shape^-1 d <= 1}`, LVLH, m and m/s.
+//! The arrival set as an answer gives it: `{d : d' shape^-1 d <= 1}` of position and velocity, and
+//! the position set, which may be tighter than its projection; LVLH, m and m/s.
 
-use nalgebra::{Matrix2, Matrix3, Matrix6, Vector2, Vector3, Vector6};
+use nalgebra::{DMatrix, Matrix2, Matrix3, Matrix6, Vector2, Vector3, Vector6};
 use vbar_proto::v1;
 
 use crate::mission::model::matrix;
@@ -8,30 +9,27 @@ use crate::mission::model::matrix;
 /// Corners of an ellipse that is drawn.
 const CORNERS: usize = 180;
 
-/// An ellipsoid of position and velocity errors around the target state.
+/// Position and velocity errors around the target state.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Ellipsoid {
     /// Lower triangular root of the shape.
     root: Matrix6<f64>,
-    /// The same of its projection on position.
+    /// The same of the position set.
     position_root: Matrix3<f64>,
-    /// The same of its projection on the orbital plane (x, z).
+    /// The same of the position set's projection on the orbital plane (x, z).
     plane_root: Matrix2<f64>,
 }
 
 impl Ellipsoid {
     /// Reads the set; the fault says what is wrong with it.
     pub(crate) fn new(place: &str, given: Option<&v1::ArrivalSet>) -> Result<Self, String> {
-        let mut faults = Vec::new();
-        let shape = matrix(place, given.and_then(|set| set.shape.as_ref()), &mut faults);
-        if shape.shape() != (6, 6) {
-            faults.push(format!("{place}: 6 x 6"));
-            return Err(faults.join("; "));
-        }
+        let shape = square(place, given.and_then(|set| set.shape.as_ref()), 6)?;
         let shape = Matrix6::from_fn(|row, column| shape[(row, column)]);
+        let position = given.and_then(|set| set.position_shape.as_ref());
+        let position = square(&format!("{place}.position_shape"), position, 3)?;
+        let position = Matrix3::from_fn(|row, column| position[(row, column)]);
         // A projection's shape is the block of the shape that belongs to the kept components.
-        let position: Matrix3<f64> = shape.fixed_view::<3, 3>(0, 0).into();
-        let plane = Matrix2::from_fn(|row, column| shape[(2 * row, 2 * column)]);
+        let plane = Matrix2::from_fn(|row, column| position[(2 * row, 2 * column)]);
         match (shape.cholesky(), position.cholesky(), plane.cholesky()) {
             (Some(root), Some(position), Some(plane)) => {
                 Ok(Self { root: root.l(), position_root: position.l(), plane_root: plane.l() })
@@ -40,20 +38,20 @@ impl Ellipsoid {
         }
     }
 
-    /// Least t with the position error in t times the set's projection on position.
+    /// `e' shape^-1 e` of a position error in the position set: at most 1 inside.
     pub(crate) fn position_level(&self, error: &Vector6<f64>) -> f64 {
         let position: Vector3<f64> = error.fixed_rows::<3>(0).into();
         let unit = self.position_root.solve_lower_triangular(&position);
-        unit.map_or(f64::INFINITY, |unit| unit.norm())
+        unit.map_or(f64::INFINITY, |unit| unit.norm_squared())
     }
 
-    /// Least t with position and velocity error in t times the set.
+    /// The same of position and velocity together.
     pub(crate) fn state_level(&self, error: &Vector6<f64>) -> f64 {
         let unit = self.root.solve_lower_triangular(error);
-        unit.map_or(f64::INFINITY, |unit| unit.norm())
+        unit.map_or(f64::INFINITY, |unit| unit.norm_squared())
     }
 
-    /// Semi-axes of the projection on the orbital plane, longer first.
+    /// Semi-axes of the position set's projection on the orbital plane, longer first.
     pub(crate) fn in_plane_semi_axes_m(&self) -> [f64; 2] {
         let shape = self.plane_root * self.plane_root.transpose();
         let (middle, half) =
@@ -75,6 +73,16 @@ impl Ellipsoid {
     }
 }
 
+fn square(place: &str, given: Option<&v1::Matrix>, size: usize) -> Result<DMatrix<f64>, String> {
+    let mut faults = Vec::new();
+    let matrix = matrix(place, given, &mut faults);
+    if matrix.shape() != (size, size) {
+        faults.push(format!("{place}: {size} x {size}"));
+        return Err(faults.join("; "));
+    }
+    Ok(matrix)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -88,9 +96,17 @@ mod tests {
         shape[(0, 2)] = 24.0 * s * c;
         shape[(2, 0)] = 24.0 * s * c;
         shape[(1, 1)] = 4.0;
-        let values = shape.transpose().as_slice().to_vec();
-        let shape = Some(v1::Matrix { rows: 6, columns: 6, values });
-        Ellipsoid::new("here", Some(&v1::ArrivalSet { shape, ..Default::default() })).expect("one")
+        let position = shape.fixed_view::<3, 3>(0, 0).into_owned();
+        let message = |size, values: &[f64]| {
+            Some(v1::Matrix { rows: size, columns: size, values: values.to_vec() })
+        };
+        let set = v1::ArrivalSet {
+            // Both are symmetric: rows and columns may be taken for each other.
+            shape: message(6, shape.as_slice()),
+            position_shape: message(3, position.as_slice()),
+            ..Default::default()
+        };
+        Ellipsoid::new("here", Some(&set)).expect("one")
     }
 
     #[test]
@@ -103,11 +119,11 @@ mod tests {
             Vector6::new(0.0, 2.0, 0.0, 0.0, 0.0, 0.0),
         ] {
             assert!((set.position_level(&tip) - 1.0).abs() < 1e-12);
-            assert!((set.state_level(&(tip * 0.5)) - 0.5).abs() < 1e-12);
+            assert!((set.state_level(&(tip * 0.5)) - 0.25).abs() < 1e-12);
         }
         // Velocity counts for the state alone.
         let fast = Vector6::new(0.0, 0.0, 0.0, 0.02, 0.0, 0.0);
-        assert!((set.state_level(&fast) - 2.0).abs() < 1e-12);
+        assert!((set.state_level(&fast) - 4.0).abs() < 1e-12);
         assert_eq!(set.position_level(&fast), 0.0);
     }
 
@@ -125,9 +141,16 @@ mod tests {
 
     #[test]
     fn ellipsoid_that_is_none_is_refused() {
-        let flat = v1::Matrix { rows: 6, columns: 6, values: vec![1.0; 36] };
-        let set = v1::ArrivalSet { shape: Some(flat), ..Default::default() };
+        let square = |size: i32| {
+            let values = vec![1.0; (size * size) as usize];
+            Some(v1::Matrix { rows: size, columns: size, values })
+        };
+        let set =
+            v1::ArrivalSet { shape: square(6), position_shape: square(3), ..Default::default() };
         assert!(Ellipsoid::new("here", Some(&set)).is_err_and(|fault| fault.contains("definite")));
+        let set = v1::ArrivalSet { shape: square(6), ..Default::default() };
+        let refused = Ellipsoid::new("here", Some(&set));
+        assert!(refused.is_err_and(|fault| fault.contains("here.position_shape")));
         assert!(Ellipsoid::new("here", None).is_err_and(|fault| fault.contains("here")));
     }
 }

@@ -6,7 +6,7 @@ use nalgebra::{Vector3, Vector6};
 use rand::{Rng, RngExt as _};
 use vbar_client::{Client, ClosedLoop};
 use vbar_proto::v1::{
-    self, Frame, Measurement, StepResponse, measurement, step_response,
+    self, ArrivalMetric, Frame, Measurement, StepResponse, measurement, step_response,
     step_stream_request::Controller,
 };
 
@@ -29,6 +29,10 @@ const PIECES: u32 = 24;
 /// Largest disagreement with the node about times and distances, relative: rounding only.
 const AGREEMENT: f64 = 1e-9;
 
+/// Largest disagreement with the node about a level, relative: the sets' condition number times
+/// rounding.
+const LEVEL_AGREEMENT: f64 = 1e-6;
+
 /// A level above 1 by no more than this is rounding.
 pub(crate) const LEVEL_TOLERANCE: f64 = 1e-9;
 
@@ -46,7 +50,8 @@ pub struct PlanFlight {
     pub disturbance_gauges: Vec<f64>,
     /// The service saw a disturbance outside the assumed set.
     pub outside_assumed_set: bool,
-    /// Level of the measured position's error in the guaranteed arrival set: at most 1 inside.
+    /// Level `e' Q^-1 e` of the measured position's error in the guaranteed arrival set
+    /// [Deaconu2014, eq. 21]: at most 1 inside.
     pub position_level: f64,
     /// The same with position and velocity.
     pub state_level: f64,
@@ -379,6 +384,7 @@ impl<'a> Session<'a> {
             }
             Some(step_response::Verdict::Arrived(arrival)) => {
                 self.check_arrival(arrival, k, measured)?;
+                self.check_level(arrival, response, measured)?;
                 Ok(None)
             }
             Some(step_response::Verdict::Command(command)) => {
@@ -409,6 +415,35 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
+    /// The level is computed twice; here the two meet.
+    fn check_level(
+        &self,
+        arrival: &v1::Arrival,
+        response: &StepResponse,
+        measured: &Vector6<f64>,
+    ) -> Result<(), String> {
+        let how = diagnostics(response)?;
+        let theirs = how.arrival_level.ok_or("an arrival without its level")?;
+        let error = measured - self.flyable.model.target;
+        let ours = match self.flyable.mission.metric() {
+            ArrivalMetric::Scaled6 | ArrivalMetric::Physical6 => {
+                self.flyable.arrival.state_level(&error)
+            }
+            ArrivalMetric::Position | ArrivalMetric::Unspecified => {
+                self.flyable.arrival.position_level(&error)
+            }
+        };
+        if (ours - theirs).abs() > LEVEL_AGREEMENT * (1.0 + ours) {
+            return Err(format!("an arrival at level {theirs}, by its own set it is {ours}"));
+        }
+        let inside = theirs <= 1.0 + LEVEL_AGREEMENT;
+        if arrival.inside_guaranteed_set != inside {
+            let said = arrival.inside_guaranteed_set;
+            return Err(format!("an arrival at level {theirs} that is inside: {said}"));
+        }
+        Ok(())
+    }
+
     fn burn(
         &self,
         command: &v1::Command,
@@ -434,10 +469,7 @@ impl<'a> Session<'a> {
         if delta_v.amax() > model.delta_v_max_m_s * (1.0 + AGREEMENT) {
             return Err(format!("a burn beyond the bound: {:?} m/s", command.delta_v_m_s));
         }
-        let Some(step_response::Diagnostics::DisturbanceFeedback(how)) = &response.diagnostics
-        else {
-            return Err("a burn without diagnostics".into());
-        };
+        let how = diagnostics(response)?;
         let nominal = components(&how.nominal_delta_v_m_s).ok_or("a burn without nominal part")?;
         let correction = components(&how.correction_m_s).ok_or("a burn without correction")?;
         if !how.clipped && (nominal + correction - delta_v).amax() > AGREEMENT {
@@ -450,6 +482,13 @@ impl<'a> Session<'a> {
             clipped: how.clipped,
             deviation_gauge: how.deviation_gauge,
         })
+    }
+}
+
+fn diagnostics(response: &StepResponse) -> Result<&v1::DisturbanceFeedbackDiagnostics, String> {
+    match &response.diagnostics {
+        Some(step_response::Diagnostics::DisturbanceFeedback(how)) => Ok(how),
+        _ => Err("an answer without diagnostics".into()),
     }
 }
 

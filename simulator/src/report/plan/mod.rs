@@ -45,8 +45,8 @@ impl PlanReport {
     /// Of each plan, beside what [`plan_rows_json`] says of it:
     ///
     /// - `runs`, and `inside_arrival_set`: runs whose measured position arrived inside the set;
-    /// - `position_level`, `state_level`: least t with the measured error in t times the
-    ///   guaranteed set, of position alone and of the whole state; at most 1 inside;
+    /// - `position_level`, `state_level`: `e' Q^-1 e` of the measured error in the guaranteed set,
+    ///   of position alone and of the whole state; at most 1 inside;
     /// - `true_position_level`, `final_distance_m`: of the true position;
     /// - `fuel_flown_m_s`: sum of |delta-v| over burns and axes;
     /// - `burns`, `clipped_burns`, `clipped_runs`;
@@ -232,8 +232,8 @@ pub fn plan_rows_text(rows: &[PlanRow]) -> String {
 /// Plans as JSON, an object each: `variant` (null for the mission's own problem), `duration_s`,
 /// `instants`, `delta_v_max_m_s`, `metric`; then either `infeasible` with its `reason` and
 /// `relaxations`, or `plan_id`, `in_plane_semi_axes_m`, `position_semi_axes_m`,
-/// `open_loop_in_plane_semi_axes_m`, `objective`, `trace`, `fuel_m_s`, `delta_v_max_least_m_s`,
-/// `fast_path`, `certificate`; and `published`.
+/// `open_loop_in_plane_semi_axes_m`, `objective`, `trace`, `fuel_m_s`, `effort_m_s`,
+/// `delta_v_max_least_m_s`, `fast_path`, `certificate`; and `published`.
 #[must_use]
 pub fn plan_rows_json(rows: &[PlanRow]) -> Value {
     rows.iter().map(|row| Value::from(row_json(row))).collect()
@@ -254,7 +254,8 @@ fn row_json(row: &PlanRow) -> Map<String, Value> {
         PlanAnswer::Infeasible(why) => {
             let relaxation = |relaxation: &v1::Relaxation| {
                 let family = relaxation.family().as_str_name();
-                json!({ "family": family, "amount_nd": relaxation.amount_nd })
+                json!({ "family": family, "amount_nd": relaxation.amount_nd,
+                "amount_m_s": relaxation.amount_m_s })
             };
             let relaxations: Vec<Value> = why.relaxations.iter().map(relaxation).collect();
             put("infeasible", json!({ "reason": why.reason, "relaxations": relaxations }));
@@ -271,6 +272,7 @@ fn row_json(row: &PlanRow) -> Map<String, Value> {
             put("objective", plan.objective.into());
             put("trace", plan.trace.into());
             put("fuel_m_s", plan.fuel_m_s.into());
+            put("effort_m_s", plan.effort_m_s.into());
             let found = plan.diagnostics.as_ref();
             put("delta_v_max_least_m_s", found.map(|how| how.delta_v_max_least_m_s).into());
             put("fast_path", found.map(|how| how.fast_path).into());

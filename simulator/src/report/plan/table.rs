@@ -129,6 +129,7 @@ pub(super) fn plan(row: &PlanRow) -> String {
         number(plan.trace),
         number(plan.fuel_m_s),
     );
+    let _ = writeln!(text, "  all corrections together at most {} m/s", number(plan.effort_m_s));
     if let Some(how) = &plan.diagnostics {
         let least = number(how.delta_v_max_least_m_s);
         let _ = writeln!(text, "  least bound on a burn with which a plan exists: {least} m/s");
