@@ -190,16 +190,16 @@ fn flown(
     options: &PlanRunOptions,
 ) -> Result<Vec<PlanMission>, SimulationError> {
     let chosen = match &options.variant {
-        Some(name) => vec![mission.with_variant(name)?],
-        None if mission.simulation.flown.is_empty() => vec![mission.clone()],
-        None => mission
-            .simulation
-            .flown
-            .iter()
-            .map(|name| mission.with_variant(name))
-            .collect::<Result<_, _>>()?,
+        Some(name) => std::slice::from_ref(name),
+        None => mission.simulation.flown.as_slice(),
     };
-    Ok(chosen.iter().map(|mission| mission.with(&options.changes)).collect::<Result<_, _>>()?)
+    let chosen: Result<Vec<PlanMission>, _> = match chosen {
+        [] => mission.with(&options.changes).map(|mission| vec![mission]),
+        names => {
+            names.iter().map(|name| mission.with_variant(name)?.with(&options.changes)).collect()
+        }
+    };
+    chosen.map_err(|fault| SimulationError::Options(fault.to_string()))
 }
 
 impl PlanMission {
