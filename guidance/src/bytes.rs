@@ -197,6 +197,20 @@ impl<'a> Reader<'a> {
     }
 }
 
+/// CRC-32 as in IEEE 802.3 and ZIP: reflected polynomial 0xEDB88320, all ones before and after.
+/// Finds every change of one bit, and every burst of up to 32.
+pub(crate) fn crc32(bytes: &[u8]) -> u32 {
+    let mut register = u32::MAX;
+    for &byte in bytes {
+        register ^= u32::from(byte);
+        for _ in 0..8 {
+            let carry = register & 1;
+            register = (register >> 1) ^ (0xEDB8_8320 * carry);
+        }
+    }
+    !register
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -226,6 +240,11 @@ mod tests {
         for length in 1..bytes.len() {
             assert!(read(&bytes[..length]).is_err(), "{length} of {} bytes", bytes.len());
         }
+    }
+
+    #[test]
+    fn checksum_has_the_standards_check_value() {
+        assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
     }
 
     #[test]

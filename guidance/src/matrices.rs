@@ -72,6 +72,34 @@ pub(crate) fn solve_lower(lower: &DMatrix<f64>, right: &DMatrix<f64>) -> DMatrix
     x
 }
 
+/// The solution X of X L = B for a lower triangular L.
+pub(crate) fn solve_lower_right(right: &DMatrix<f64>, lower: &DMatrix<f64>) -> DMatrix<f64> {
+    let n = lower.nrows();
+    let mut x = right.clone();
+    for row in 0..x.nrows() {
+        for j in (0..n).rev() {
+            let known: f64 = (j + 1..n).map(|k| x[(row, k)] * lower[(k, j)]).sum();
+            x[(row, j)] = (x[(row, j)] - known) / lower[(j, j)];
+        }
+    }
+    x
+}
+
+/// Orthonormal columns that span the range of A: left singular vectors whose singular values
+/// exceed `cut_off` of the largest.
+pub(crate) fn range(a: &DMatrix<f64>, cut_off: f64) -> DMatrix<f64> {
+    let scale = a.amax();
+    if a.ncols() == 0 || scale == 0.0 {
+        return DMatrix::zeros(a.nrows(), 0);
+    }
+    let svd = (a / scale).svd(true, false);
+    let least = cut_off * svd.singular_values.amax();
+    let Some(u) = svd.u else { return DMatrix::zeros(a.nrows(), 0) };
+    let kept: Vec<usize> =
+        (0..svd.singular_values.len()).filter(|&i| svd.singular_values[i] > least).collect();
+    u.select_columns(&kept)
+}
+
 /// Eigenvalues of a small symmetric matrix, least first: Jacobi's rotations in cyclic order, which
 /// keep small eigenvalues accurate beside large ones.
 pub(crate) fn symmetric_eigenvalues(a: &DMatrix<f64>) -> Vec<f64> {

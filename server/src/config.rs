@@ -8,7 +8,7 @@ use std::{fmt, net::SocketAddr, path::PathBuf, thread, time::Duration};
 
 use serde::Deserialize;
 
-use crate::wire::Limits;
+use crate::wire::{Limits, PLAN_INSTANTS_MAX};
 
 /// Everything a node needs to know.
 #[derive(Debug, Clone, PartialEq)]
@@ -123,6 +123,7 @@ impl Config {
         count("limits.inputs_max", self.limits.inputs_max, 1000);
         count("limits.steps_max", self.limits.steps_max, 10_000_000);
         count("limits.polytope_rows_max", self.limits.polytope_rows_max, 100_000);
+        count("limits.plan_instants_max", self.limits.plan_instants_max, PLAN_INSTANTS_MAX);
         let hour = Duration::from_secs(3600);
         let mut time = |setting, value: Duration, least: Duration| {
             let expected = format!("{least:?} to {hour:?}");
@@ -166,6 +167,7 @@ pub struct Settings {
     pub inputs_max: Option<usize>,
     pub steps_max: Option<usize>,
     pub polytope_rows_max: Option<usize>,
+    pub plan_instants_max: Option<usize>,
 }
 
 /// Why a source of configuration could not be read.
@@ -205,7 +207,8 @@ macro_rules! for_each_setting {
             states_max,
             inputs_max,
             steps_max,
-            polytope_rows_max
+            polytope_rows_max,
+            plan_instants_max
         )
     };
 }
@@ -319,6 +322,9 @@ impl Settings {
                 polytope_rows_max: self
                     .polytope_rows_max
                     .unwrap_or(config.limits.polytope_rows_max),
+                plan_instants_max: self
+                    .plan_instants_max
+                    .unwrap_or(config.limits.plan_instants_max),
             },
         };
         if faults.is_empty() { Ok(applied) } else { Err(SettingsError::Durations(faults)) }

@@ -6,7 +6,7 @@ use crate::{
     compute::Compute,
     config::{Config, ConfigFault, StoreLocation},
     service::Service,
-    store::{ArtifactStore, DirectoryStore, MemoryStore},
+    store::{DirectoryStore, MemoryStore, RecordStore},
     telemetry::Metrics,
     transport::{Front, TransportOptions},
     wire::InfoAnswer,
@@ -71,7 +71,7 @@ impl Node {
         let refused = |source| StartError::Listen { address, source };
         let listener = TcpListener::bind(address).await.map_err(refused)?;
         let local_address = listener.local_addr().map_err(refused)?;
-        let store: Arc<dyn ArtifactStore> = match &config.store {
+        let store: Arc<dyn RecordStore> = match &config.store {
             StoreLocation::Memory { bytes_max } => Arc::new(MemoryStore::new(*bytes_max)),
             StoreLocation::Directory(root) => Arc::new(
                 DirectoryStore::open(root).map_err(|fault| StartError::Store(fault.to_string()))?,

@@ -1,17 +1,23 @@
 //! Optimisation programs: what is asked ([`HorizonProgram`]), how ([`Solver`]), what came of it
 //! ([`Solution`]), and whether it is true ([`verify`], which trusts no solver).
+//!
+//! Beside them two smaller kinds: [`least_impulses`] and, over second-order cones, [`ConeProgram`].
 
 mod clarabel;
 mod dual_simplex;
 mod gauge;
+mod impulses;
 mod projection;
+mod second_order;
 mod tables;
 mod verify;
 
 pub use clarabel::{Clarabel, RelaxedFamily, least_relaxation};
 pub use dual_simplex::DualSimplex;
 pub use gauge::zonotope_gauge;
+pub use impulses::{Impulses, impulse_bound, least_impulses, least_limit};
 pub use projection::project_onto_polytope;
+pub use second_order::{Affine, ConeProgram, ConeSolution};
 pub use tables::PlantTables;
 pub use verify::{DualBound, Residual, Residuals, dual_bound, farkas_margin, simulate, verify};
 

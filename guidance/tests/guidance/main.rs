@@ -2,5 +2,6 @@
 
 #![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
 
+mod disturbance_feedback_golden;
 mod golden;
 mod laws;

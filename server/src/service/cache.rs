@@ -7,7 +7,13 @@ use std::{
 
 use vbar_guidance::control::Infeasibility;
 
-use crate::wire::{ArtifactAnswer, ArtifactId, Problem};
+use crate::{
+    store::Shelf,
+    wire::{ArtifactAnswer, ArtifactId, Problem},
+};
+
+/// What is remembered, by the shelf it stands on in the store.
+pub(super) type Key = (Shelf, ArtifactId);
 
 /// What a precompute came to.
 #[derive(Debug, Clone)]
@@ -41,7 +47,7 @@ struct Entries {
     bytes: usize,
     /// Raised at each use.
     now: u64,
-    by_id: HashMap<ArtifactId, Entry>,
+    by_id: HashMap<Key, Entry>,
 }
 
 #[derive(Debug)]
@@ -57,7 +63,7 @@ impl Cache {
     }
 
     /// What is remembered of `id`.
-    pub(super) fn get(&self, id: &ArtifactId) -> Option<Outcome> {
+    pub(super) fn get(&self, id: &Key) -> Option<Outcome> {
         let mut entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
         entries.now += 1;
         let now = entries.now;
@@ -68,7 +74,7 @@ impl Cache {
 
     /// Remembers `outcome`; forgets what was not used for longest if there is no room. The newest
     /// stays even if it alone is too large: somebody is about to use it.
-    pub(super) fn insert(&self, id: ArtifactId, outcome: Outcome) {
+    pub(super) fn insert(&self, id: Key, outcome: Outcome) {
         let mut entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
         let entries = &mut *entries;
         entries.now += 1;
@@ -136,8 +142,12 @@ mod tests {
         Outcome::Infeasible(call.problem, Arc::new(why))
     }
 
+    fn key(n: u8) -> Key {
+        (Shelf::Artifacts, ArtifactId([n; 32]))
+    }
+
     fn reason(cache: &Cache, n: u8) -> Option<String> {
-        match cache.get(&ArtifactId([n; 32]))? {
+        match cache.get(&key(n))? {
             Outcome::Infeasible(_, why) => Some(why.reason.clone()),
             Outcome::Made(_) => None,
         }
@@ -147,16 +157,16 @@ mod tests {
     fn cache_forgets_what_was_not_used_for_longest() {
         let cache = Cache::new(3 * outcome("").bytes());
         for n in [1, 2, 3] {
-            cache.insert(ArtifactId([n; 32]), outcome(&n.to_string()));
+            cache.insert(key(n), outcome(&n.to_string()));
         }
         assert_eq!(reason(&cache, 1).as_deref(), Some("1"));
-        cache.insert(ArtifactId([4; 32]), outcome("4"));
+        cache.insert(key(4), outcome("4"));
         assert_eq!(reason(&cache, 2), None);
         for n in [1, 3, 4] {
             assert_eq!(reason(&cache, n), Some(n.to_string()));
         }
         // Replaced, not counted twice.
-        cache.insert(ArtifactId([4; 32]), outcome("again"));
+        cache.insert(key(4), outcome("again"));
         assert_eq!(reason(&cache, 4).as_deref(), Some("again"));
         assert_eq!(reason(&cache, 1).as_deref(), Some("1"));
     }
@@ -164,9 +174,9 @@ mod tests {
     #[test]
     fn cache_keeps_the_newest_even_if_it_is_too_large() {
         let cache = Cache::new(1);
-        cache.insert(ArtifactId([1; 32]), outcome("1"));
+        cache.insert(key(1), outcome("1"));
         assert!(reason(&cache, 1).is_some());
-        cache.insert(ArtifactId([2; 32]), outcome("2"));
+        cache.insert(key(2), outcome("2"));
         assert!(reason(&cache, 1).is_none() && reason(&cache, 2).is_some());
     }
 }

@@ -10,7 +10,7 @@ use vbar_guidance::{
 use crate::{
     compute::ComputeError,
     store::StoreError,
-    wire::{StateFault, Violation, Violations},
+    wire::{Missing, StateFault, Violation, Violations},
 };
 
 /// The codes of `google.rpc.Code` that this service answers with.
@@ -84,6 +84,20 @@ impl Error {
     pub(crate) fn internal(reason: &'static str, detail: &str) -> Self {
         tracing::error!(reason, detail, "internal error");
         Self::new(Code::Internal, reason, "internal error; the request id finds it in the log")
+    }
+
+    /// A document needs what the mission does not have.
+    pub(crate) fn missing(Missing(fields): Missing) -> Self {
+        let message = format!("the mission lacks what this format needs: {}", fields.join(", "));
+        let violation = |path: &str| Violation {
+            path: path.to_owned(),
+            expected: "a value (this format needs it)".to_owned(),
+            got: "nothing".to_owned(),
+        };
+        Self {
+            violations: fields.into_iter().map(violation).collect(),
+            ..Self::new(Code::FailedPrecondition, "MISSION_LACKS_FIELDS", message)
+        }
     }
 
     /// The mathematics found the problem at fault, or failed. `prefix` is where the method's

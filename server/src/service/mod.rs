@@ -11,7 +11,6 @@ use std::{
 };
 
 use bytes::Bytes;
-use sha2::{Digest, Sha256};
 use vbar_guidance::{
     Budget, Method,
     control::{Certificate, PrepareError, StepError},
@@ -23,13 +22,15 @@ pub(crate) use session::{Session, SessionAnswer};
 
 use crate::{
     compute::Compute,
-    store::{ArtifactStore, Put},
+    store::{Put, RecordStore, Shelf},
     telemetry::{Metrics, OutcomeLabels},
     wire::{
         Artifact, ArtifactAnswer, ArtifactCall, ArtifactId, Controller, ControllerState,
-        DecidedStep, ElapsedAndState, InfoAnswer, InfoCall, Limits, OperationAnswer, OperationName,
-        OperationsAnswer, OperationsCall, PlanAnswer, PlanCall, PlanResult, PrecomputeCall,
-        Problem, Provenance, SolverWork, State, StateFault, StepAnswer, StepCall, VerdictKind,
+        DecidedStep, Document, ElapsedAndState, ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer,
+        KeptPlanCall, Limits, OperationAnswer, OperationName, OperationsAnswer, OperationsCall,
+        PlanAnswer, PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, PrecomputeCall,
+        Problem, Provenance, SolverWork, State, StateFault, StepAnswer, StepCall, UploadAnswer,
+        UploadCall, VerdictKind,
     },
 };
 use cache::{Cache, Outcome};
@@ -60,18 +61,18 @@ pub(crate) struct Call {
 #[derive(Debug)]
 pub(crate) struct Service {
     compute: Compute,
-    store: Arc<dyn ArtifactStore>,
+    store: Arc<dyn RecordStore>,
     cache: Cache,
     metrics: Arc<Metrics>,
     info: InfoAnswer,
 }
 
 impl Service {
-    /// A service that computes with `compute`, keeps artifacts in `store` and at most
+    /// A service that computes with `compute`, keeps artifacts and plans in `store` and at most
     /// `cache_bytes_max` bytes of them in memory.
     pub(crate) fn new(
         compute: Compute,
-        store: Arc<dyn ArtifactStore>,
+        store: Arc<dyn RecordStore>,
         cache_bytes_max: usize,
         metrics: Arc<Metrics>,
         info: InfoAnswer,
@@ -115,7 +116,7 @@ impl Service {
         decided.await.map(|timed| timed.map(StepAnswer::Decided))
     }
 
-    /// `ComputePlan`.
+    /// `ComputePlan`. What can be flown as it is, is kept.
     pub(crate) async fn plan(
         &self,
         ask: PlanCall,
@@ -125,7 +126,7 @@ impl Service {
             let timed = self.validate(ask.problem, call).await?;
             let (id, method) = timed.value;
             let provenance = Arc::new(provenance(method, id, String::new()));
-            let value = PlanAnswer { provenance, outcome: None };
+            let value = PlanAnswer { provenance, outcome: None, plan_id: None };
             return Ok(Timed { value, compute: timed.compute });
         }
         let (method, id) = (ask.problem.method(), record::problem_id(&ask.problem));
@@ -134,22 +135,87 @@ impl Service {
             Outcome::Infeasible(problem, why) => {
                 let provenance = Arc::new(provenance(method, id, String::new()));
                 let outcome = Some(PlanResult::NoController(problem, why));
-                let value = PlanAnswer { provenance, outcome };
+                let value = PlanAnswer { provenance, outcome, plan_id: None };
                 return Ok(Timed { value, compute: Duration::ZERO });
             }
         };
-        let artifact = Arc::clone(&loaded.artifact);
+        let (artifact, store) = (Arc::clone(&loaded.artifact), Arc::clone(&self.store));
         let initial = ask.initial;
-        let work = move |budget: Budget<'_>| artifact.plan(&initial, budget);
+        let work = move |budget: Budget<'_>| -> Result<(PlanVerdict, Option<Loaded>), Error> {
+            let verdict = artifact.plan(initial.as_ref(), budget);
+            let verdict = verdict.map_err(|fault| Error::step("initial", fault))?;
+            let kept = artifact.is_plan().then(|| keep_plan(&*store, artifact));
+            Ok((verdict, kept.transpose()?))
+        };
         let timed = self.compute.run("plan", call.deadline, work).await?;
-        let verdict = timed.value.map_err(|fault| Error::step("initial", fault))?;
+        let (verdict, kept) = timed.value?;
         self.count(verdict.work());
         if let Some(certificate) = verdict.certificate() {
             self.withhold_unless_passed(Some(certificate))?;
         }
+        let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
         let outcome = Some(PlanResult::Decided(loaded.artifact, verdict));
-        let value = PlanAnswer { provenance: loaded.provenance, outcome };
+        let value = PlanAnswer { provenance: loaded.provenance, outcome, plan_id };
         Ok(Timed { value, compute: timed.compute })
+    }
+
+    /// `UploadPlan`: kept if everything it claims holds.
+    pub(crate) async fn upload(
+        &self,
+        ask: UploadCall,
+        call: &Call,
+    ) -> Result<Timed<UploadAnswer>, Error> {
+        let store = Arc::clone(&self.store);
+        let UploadCall { candidate, validate_only } = ask;
+        let work = move |_: Budget<'_>| -> Result<(Arc<Artifact>, Option<Loaded>), Error> {
+            let plan = Arc::new(candidate.verify()?);
+            let kept = (!validate_only).then(|| keep_plan(&*store, Arc::clone(&plan)));
+            Ok((plan, kept.transpose()?))
+        };
+        let timed = self.compute.run("verify", call.deadline, work).await?;
+        let (plan, kept) = timed.value?;
+        let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
+        Ok(Timed { value: UploadAnswer { plan, plan_id }, compute: timed.compute })
+    }
+
+    /// `GetPlan`.
+    pub(crate) async fn kept_plan(
+        &self,
+        ask: KeptPlanCall,
+        call: &Call,
+    ) -> Result<KeptPlanAnswer, Error> {
+        self.load(Shelf::Plans, ask.id, call).await.map(kept_plan)
+    }
+
+    /// `ListPlans`.
+    pub(crate) async fn kept_plans(
+        &self,
+        ask: PlansCall,
+        call: &Call,
+    ) -> Result<PlansAnswer, Error> {
+        let (ids, next) = self.page(Shelf::Plans, ask.after, ask.page_size, call).await?;
+        let mut plans = Vec::with_capacity(ids.len());
+        for id in ids {
+            plans.push(kept_plan(self.load(Shelf::Plans, id, call).await?));
+        }
+        Ok(PlansAnswer { plans, next })
+    }
+
+    /// `ExportPlan`.
+    pub(crate) async fn export(
+        &self,
+        ask: ExportCall,
+        call: &Call,
+    ) -> Result<Timed<Document>, Error> {
+        let ExportCall { id, order } = ask;
+        let plan = self.load(Shelf::Plans, id, call).await?.artifact;
+        let work = move |_: Budget<'_>| plan.export(&id.to_string(), &order);
+        let timed = self.compute.run("export", call.deadline, work).await?;
+        match timed.value {
+            Some(Ok(value)) => Ok(Timed { value, compute: timed.compute }),
+            Some(Err(missing)) => Err(Error::missing(missing)),
+            None => Err(Error::internal("NOT_A_PLAN", &id.to_string())),
+        }
     }
 
     /// `Precompute`. It answers when it is done: an operation is its artifact.
@@ -172,7 +238,7 @@ impl Service {
         ask: ArtifactCall,
         call: &Call,
     ) -> Result<ArtifactAnswer, Error> {
-        self.load(ask.id, call).await
+        self.load(Shelf::Artifacts, ask.id, call).await
     }
 
     /// `GetOperation` and `WaitOperation`: there is nothing to wait for, because
@@ -182,9 +248,9 @@ impl Service {
         ask: OperationName,
         call: &Call,
     ) -> Result<OperationAnswer, Error> {
-        match self.cache.get(&ask.id) {
+        match self.cache.get(&(Shelf::Artifacts, ask.id)) {
             Some(outcome) => Ok(operation(ask.id, outcome)),
-            None => match self.load(ask.id, call).await {
+            None => match self.load(Shelf::Artifacts, ask.id, call).await {
                 Ok(loaded) => Ok(OperationAnswer::Made(loaded)),
                 Err(error) if error.code == Code::NotFound => Err(Error::new(
                     Code::NotFound,
@@ -202,18 +268,31 @@ impl Service {
         ask: OperationsCall,
         call: &Call,
     ) -> Result<OperationsAnswer, Error> {
-        let store = Arc::clone(&self.store);
-        let list =
-            move |_: Budget<'_>| store.list(ask.after.as_ref().map(|id| &id.0), ask.page_size + 1);
-        let mut ids = self.compute.run("list", call.deadline, list).await?.value?;
-        let more = ids.len() > ask.page_size;
-        ids.truncate(ask.page_size);
-        let next = ids.last().filter(|_| more).map(|id| ArtifactId(*id));
+        let (ids, next) = self.page(Shelf::Artifacts, ask.after, ask.page_size, call).await?;
         let mut operations = Vec::with_capacity(ids.len());
         for id in ids {
-            operations.push(OperationAnswer::Made(self.load(ArtifactId(id), call).await?));
+            let loaded = self.load(Shelf::Artifacts, id, call).await?;
+            operations.push(OperationAnswer::Made(loaded));
         }
         Ok(OperationsAnswer { operations, next })
+    }
+
+    /// Ids of one page of a shelf, and where the next page begins.
+    async fn page(
+        &self,
+        shelf: Shelf,
+        after: Option<ArtifactId>,
+        page_size: usize,
+        call: &Call,
+    ) -> Result<(Vec<ArtifactId>, Option<ArtifactId>), Error> {
+        let store = Arc::clone(&self.store);
+        let list =
+            move |_: Budget<'_>| store.list(shelf, after.as_ref().map(|id| &id.0), page_size + 1);
+        let mut ids = self.compute.run("list", call.deadline, list).await?.value?;
+        let more = ids.len() > page_size;
+        ids.truncate(page_size);
+        let next = ids.last().filter(|_| more).map(|id| ArtifactId(*id));
+        Ok((ids.into_iter().map(ArtifactId).collect(), next))
     }
 
     /// `CancelOperation`: an operation that can be named is done, and success promises nothing
@@ -279,7 +358,12 @@ impl Service {
     /// The artifact a step is to use.
     async fn controller(&self, controller: Controller, call: &Call) -> Result<Found, Error> {
         match controller {
-            Controller::Artifact(id) => self.load(id, call).await.map(Found::Controller),
+            Controller::Artifact(id) => {
+                self.load(Shelf::Artifacts, id, call).await.map(Found::Controller)
+            }
+            Controller::Plan(id) => {
+                self.load(Shelf::Plans, id, call).await.map(Found::Controller)
+            }
             Controller::Problem(problem) => {
                 let id = record::problem_id(&problem);
                 match self.obtain(id, problem, call).await? {
@@ -294,22 +378,32 @@ impl Service {
         }
     }
 
-    /// A stored artifact.
-    async fn load(&self, id: ArtifactId, call: &Call) -> Result<Loaded, Error> {
-        if let Some(Outcome::Made(loaded)) = self.cache.get(&id) {
+    /// What stands on a shelf.
+    async fn load(&self, shelf: Shelf, id: ArtifactId, call: &Call) -> Result<Loaded, Error> {
+        if let Some(Outcome::Made(loaded)) = self.cache.get(&(shelf, id)) {
             self.looked_up("hit");
             return Ok(loaded);
         }
         let store = Arc::clone(&self.store);
-        let work = move |_: Budget<'_>| stored(&*store, id);
+        let work = move |_: Budget<'_>| stored(&*store, shelf, id);
         let Some(loaded) = self.compute.run("load", call.deadline, work).await?.value? else {
             self.looked_up("unknown");
-            let message = format!("artifact {id} is not known; Precompute makes it");
-            return Err(Error::new(Code::NotFound, "ARTIFACT_UNKNOWN", message));
+            let (reason, message) = match shelf {
+                Shelf::Artifacts => {
+                    ("ARTIFACT_UNKNOWN", format!("artifact {id} is not known; Precompute makes it"))
+                }
+                Shelf::Plans => ("PLAN_UNKNOWN", format!("plan {id} is not kept here")),
+            };
+            return Err(Error::new(Code::NotFound, reason, message));
         };
         self.looked_up("loaded");
-        self.cache.insert(id, Outcome::Made(loaded.clone()));
-        Ok(loaded)
+        Ok(self.remember(shelf, loaded))
+    }
+
+    /// Keeps what was loaded in memory for a while.
+    fn remember(&self, shelf: Shelf, loaded: Loaded) -> Loaded {
+        self.cache.insert((shelf, loaded.id), Outcome::Made(loaded.clone()));
+        loaded
     }
 
     /// What a precompute of `problem`, whose id is `id`, comes to: remembered, stored, or computed
@@ -320,13 +414,14 @@ impl Service {
         problem: Problem,
         call: &Call,
     ) -> Result<Outcome, Error> {
-        if let Some(outcome) = self.cache.get(&id) {
+        let key = (Shelf::Artifacts, id);
+        if let Some(outcome) = self.cache.get(&key) {
             self.looked_up("hit");
             return Ok(outcome);
         }
         let store = Arc::clone(&self.store);
         let work = move |budget: Budget<'_>| -> Result<(Outcome, &'static str), Error> {
-            if let Some(loaded) = stored(&*store, id)? {
+            if let Some(loaded) = stored(&*store, Shelf::Artifacts, id)? {
                 return Ok((Outcome::Made(loaded), "loaded"));
             }
             let artifact = match problem.prepare(budget) {
@@ -347,7 +442,7 @@ impl Service {
             }
         })?;
         self.looked_up(source);
-        self.cache.insert(id, outcome.clone());
+        self.cache.insert(key, outcome.clone());
         Ok(outcome)
     }
 
@@ -359,7 +454,7 @@ impl Service {
         call: &Call,
     ) -> Result<Timed<(ArtifactId, Method)>, Error> {
         let (id, method) = (record::problem_id(&problem), problem.method());
-        if self.cache.get(&id).is_some() {
+        if self.cache.get(&(Shelf::Artifacts, id)).is_some() {
             return Ok(Timed { value: (id, method), compute: Duration::ZERO });
         }
         let work = move |budget: Budget<'_>| match problem.prepare(budget) {
@@ -411,39 +506,65 @@ fn provenance(method: Method, id: ArtifactId, content_sha256: String) -> Provena
     }
 }
 
-fn loaded(id: ArtifactId, artifact: Artifact, bytes: &[u8]) -> Loaded {
-    let content = ArtifactId(Sha256::digest(bytes).into()).to_string();
-    let provenance = provenance(artifact.method(), id, content);
-    Loaded {
-        id,
-        artifact: Arc::new(artifact),
-        provenance: Arc::new(provenance),
-        size_bytes: bytes.len(),
-    }
+/// `id` is the name under which it was asked for: the problem's for an artifact, the content's for
+/// a plan. Controller states are bound to it.
+fn loaded(id: ArtifactId, artifact: Arc<Artifact>, bytes: &[u8]) -> Loaded {
+    let method = artifact.method();
+    let problem = record::artifact_id(method, &artifact.canonical_problem());
+    let provenance = provenance(method, problem, record::content_id(bytes).to_string());
+    Loaded { id, artifact, provenance: Arc::new(provenance), size_bytes: bytes.len() }
 }
 
-/// Reads and checks what is stored under `id`.
-fn stored(store: &dyn ArtifactStore, id: ArtifactId) -> Result<Option<Loaded>, Error> {
-    let Some(record) = store.get(&id.0)? else { return Ok(None) };
-    match record::decode(id, &record) {
-        Ok((artifact, bytes)) => Ok(Some(loaded(id, artifact, bytes))),
+fn kept_plan(loaded: Loaded) -> KeptPlanAnswer {
+    let Loaded { id, artifact, provenance, size_bytes } = loaded;
+    KeptPlanAnswer { id, plan: artifact, provenance, size_bytes }
+}
+
+/// Reads and checks what stands on a shelf under `id`.
+fn stored(
+    store: &dyn RecordStore,
+    shelf: Shelf,
+    id: ArtifactId,
+) -> Result<Option<Loaded>, Error> {
+    let Some(record) = store.get(shelf, &id.0)? else { return Ok(None) };
+    match record::decode(shelf, id, &record) {
+        Ok((artifact, bytes)) => Ok(Some(loaded(id, Arc::new(artifact), bytes))),
         Err(what) => {
             tracing::error!(%id, what, "unreadable record");
-            let message = format!("the record of artifact {id} cannot be used: {what}");
-            Err(Error::new(Code::DataLoss, "ARTIFACT_DAMAGED", message))
+            let (reason, kind) = match shelf {
+                Shelf::Artifacts => ("ARTIFACT_DAMAGED", "artifact"),
+                Shelf::Plans => ("PLAN_DAMAGED", "plan"),
+            };
+            let message = format!("the record of {kind} {id} cannot be used: {what}");
+            Err(Error::new(Code::DataLoss, reason, message))
         }
     }
 }
 
 /// Stores a new artifact. If another call was faster, both must have made the same bytes.
-fn keep(store: &dyn ArtifactStore, id: ArtifactId, artifact: Artifact) -> Result<Loaded, Error> {
+fn keep(store: &dyn RecordStore, id: ArtifactId, artifact: Artifact) -> Result<Loaded, Error> {
+    put(store, Shelf::Artifacts, id, Arc::new(artifact))
+}
+
+/// Stores a plan under the digest of its content; the same plan twice is one plan.
+fn keep_plan(store: &dyn RecordStore, plan: Arc<Artifact>) -> Result<Loaded, Error> {
+    let id = record::content_id(&plan.to_bytes());
+    put(store, Shelf::Plans, id, plan)
+}
+
+fn put(
+    store: &dyn RecordStore,
+    shelf: Shelf,
+    id: ArtifactId,
+    artifact: Arc<Artifact>,
+) -> Result<Loaded, Error> {
     let bytes = artifact.to_bytes();
     let record = Bytes::from(record::encode(artifact.method(), &bytes));
-    match store.put_if_absent(&id.0, record.clone())? {
+    match store.put_if_absent(shelf, &id.0, record.clone())? {
         Put::Created => {}
         Put::Existing(existing) if existing == record => {}
         Put::Existing(_) => {
-            return Err(Error::internal(CONFLICT, &format!("two contents for artifact {id}")));
+            return Err(Error::internal(CONFLICT, &format!("two contents for {id}")));
         }
     }
     Ok(loaded(id, artifact, &bytes))

@@ -1,16 +1,19 @@
-//! What is stored for an artifact.
+//! What is stored for an artifact or a plan.
 //!
 //! ```text
 //! "VBAR" | format version 1 | l | method's name (l) | v | method's version (v) | artifact's bytes
 //! ```
 //!
 //! An artifact is found by the digest of the problem it answers, so a record is good only if the
-//! problem inside it has that digest.
+//! problem inside it has that digest. A plan is found by the digest of its own bytes.
 
 use sha2::{Digest, Sha256};
 use vbar_guidance::Method;
 
-use crate::wire::{Artifact, ArtifactId, Problem};
+use crate::{
+    store::Shelf,
+    wire::{Artifact, ArtifactId, Problem},
+};
 
 const MAGIC: &[u8; 4] = b"VBAR";
 const FORMAT_VERSION: u8 = 1;
@@ -35,6 +38,11 @@ fn length(word: &str) -> u8 {
     u8::try_from(word.len()).expect("methods have short names and versions")
 }
 
+/// sha256 of an artifact's or plan's own bytes.
+pub(super) fn content_id(bytes: &[u8]) -> ArtifactId {
+    ArtifactId(Sha256::digest(bytes).into())
+}
+
 /// The record of an artifact whose own bytes are `bytes`.
 pub(super) fn encode(method: Method, bytes: &[u8]) -> Vec<u8> {
     let mut record = Vec::with_capacity(bytes.len() + 64);
@@ -49,7 +57,11 @@ pub(super) fn encode(method: Method, bytes: &[u8]) -> Vec<u8> {
 }
 
 /// The artifact in a record, checked again, and its own bytes.
-pub(super) fn decode(id: ArtifactId, record: &[u8]) -> Result<(Artifact, &[u8]), String> {
+pub(super) fn decode(
+    shelf: Shelf,
+    id: ArtifactId,
+    record: &[u8],
+) -> Result<(Artifact, &[u8]), String> {
     let rest = record.strip_prefix(MAGIC).ok_or("it is not an artifact's record")?;
     let (version, mut rest) = rest.split_first().ok_or("it is truncated")?;
     if *version != FORMAT_VERSION {
@@ -68,9 +80,19 @@ pub(super) fn decode(id: ArtifactId, record: &[u8]) -> Result<(Artifact, &[u8]),
         ));
     }
     let artifact = Artifact::from_bytes(method, rest)?;
-    let found = artifact_id(method, &artifact.canonical_problem());
-    if found != id {
-        return Err(format!("it answers problem {found}"));
+    match shelf {
+        Shelf::Artifacts => {
+            let found = artifact_id(method, &artifact.canonical_problem());
+            if found != id {
+                return Err(format!("it answers problem {found}"));
+            }
+        }
+        Shelf::Plans => {
+            let found = content_id(rest);
+            if found != id || !artifact.is_plan() {
+                return Err(format!("it is not this plan but {found}"));
+            }
+        }
     }
     Ok((artifact, rest))
 }
@@ -90,7 +112,7 @@ mod tests {
     fn record_faults_are_named() {
         let id = ArtifactId([1; 32]);
         let good = encode(Method::VariableHorizon, b"");
-        let fault = |record: &[u8]| decode(id, record).map(|_| ()).unwrap_err();
+        let fault = |record: &[u8]| decode(Shelf::Artifacts, id, record).map(|_| ()).unwrap_err();
         assert_eq!(fault(b"something else"), "it is not an artifact's record");
         let mut other = good.clone();
         other[4] = 2;

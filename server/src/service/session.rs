@@ -64,7 +64,7 @@ impl Session {
             }
             (None, Some(_)) => false,
             (None, None) => {
-                let expected = "one of artifact_id, problem until the loop is open";
+                let expected = "one of artifact_id, problem, plan_id until the loop is open";
                 return Err(Error::field("controller", expected, "nothing"));
             }
             (Some(_), Some(_)) => {

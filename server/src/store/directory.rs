@@ -1,9 +1,10 @@
 //! Records as files in one directory.
 //!
 //! ```text
-//! <root>/format            "vbar artifacts 1\n"
-//! <root>/v1/<xx>/<id>      one record; <id> in hexadecimal, <xx> its first two digits
-//! <root>/v1/incoming/…     records being written
+//! <root>/format              "vbar artifacts 1\n"
+//! <root>/v1/<xx>/<id>        one artifact; <id> in hexadecimal, <xx> its first two digits
+//! <root>/v1/plans/<xx>/<id>  one plan
+//! <root>/v1/incoming/…       records being written
 //! ```
 //!
 //! A record's file is the sha256 of its bytes (32 bytes), then the bytes. It is written in
@@ -23,9 +24,10 @@ use std::{
 use bytes::Bytes;
 use sha2::{Digest, Sha256};
 
-use super::{ArtifactStore, Put, RecordId, StoreError, hex};
+use super::{Put, RecordId, RecordStore, Shelf, StoreError, hex};
 
 const FORMAT: &str = "vbar artifacts 1\n";
+const PLANS: &str = "plans";
 const DIGEST_LENGTH: usize = 32;
 /// No write of one record takes nearly this long.
 const LEFTOVER_AGE: Duration = Duration::from_secs(600);
@@ -47,7 +49,9 @@ impl DirectoryStore {
     pub(crate) fn open(root: &Path) -> Result<Self, StoreError> {
         let records = root.join("v1");
         let incoming = records.join("incoming");
-        fs::create_dir_all(&incoming).map_err(io_error("creating", &incoming))?;
+        for folder in [&incoming, &records.join(PLANS)] {
+            fs::create_dir_all(folder).map_err(io_error("creating", folder))?;
+        }
         let format = root.join("format");
         match fs::read_to_string(&format) {
             Ok(found) if found == FORMAT => {}
@@ -65,8 +69,17 @@ impl DirectoryStore {
         Ok(Self { records, incoming, written: AtomicU64::new(0) })
     }
 
-    fn path(&self, id: &RecordId) -> PathBuf {
-        self.records.join(hex(&id[..1])).join(hex(id))
+    /// The folder of a shelf. Artifacts stood here alone once, which is why they have no folder of
+    /// their own; names of other shelves are longer than two letters.
+    fn shelf(&self, shelf: Shelf) -> PathBuf {
+        match shelf {
+            Shelf::Artifacts => self.records.clone(),
+            Shelf::Plans => self.records.join(PLANS),
+        }
+    }
+
+    fn path(&self, shelf: Shelf, id: &RecordId) -> PathBuf {
+        self.shelf(shelf).join(hex(&id[..1])).join(hex(id))
     }
 
     /// Writes and syncs a file nobody else knows yet.
@@ -84,12 +97,12 @@ impl DirectoryStore {
     }
 }
 
-impl ArtifactStore for DirectoryStore {
-    fn put_if_absent(&self, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError> {
-        if let Some(existing) = self.get(id)? {
+impl RecordStore for DirectoryStore {
+    fn put_if_absent(&self, shelf: Shelf, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError> {
+        if let Some(existing) = self.get(shelf, id)? {
             return Ok(Put::Existing(existing));
         }
-        let path = self.path(id);
+        let path = self.path(shelf, id);
         let folder = path.parent().expect("a record lies in a folder");
         fs::create_dir_all(folder).map_err(io_error("creating", folder))?;
         let incoming = self.write_incoming(&bytes)?;
@@ -100,11 +113,12 @@ impl ArtifactStore for DirectoryStore {
                 removed?;
                 let sync = |folder: &Path| File::open(folder).and_then(|folder| folder.sync_all());
                 sync(folder).map_err(io_error("syncing", folder))?;
-                sync(&self.records).map_err(io_error("syncing", &self.records))?;
+                let shelf = self.shelf(shelf);
+                sync(&shelf).map_err(io_error("syncing", &shelf))?;
                 Ok(Put::Created)
             }
             Err(fault) if fault.kind() == io::ErrorKind::AlreadyExists => {
-                let existing = self.get(id)?.ok_or_else(|| StoreError::Damaged {
+                let existing = self.get(shelf, id)?.ok_or_else(|| StoreError::Damaged {
                     id: hex(id),
                     what: "it was removed while it was being read",
                 })?;
@@ -114,8 +128,8 @@ impl ArtifactStore for DirectoryStore {
         }
     }
 
-    fn get(&self, id: &RecordId) -> Result<Option<Bytes>, StoreError> {
-        let path = self.path(id);
+    fn get(&self, shelf: Shelf, id: &RecordId) -> Result<Option<Bytes>, StoreError> {
+        let path = self.path(shelf, id);
         let file = match fs::read(&path) {
             Ok(file) => Bytes::from(file),
             Err(fault) if fault.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -132,14 +146,20 @@ impl ArtifactStore for DirectoryStore {
         Ok(Some(bytes))
     }
 
-    fn list(&self, after: Option<&RecordId>, limit: usize) -> Result<Vec<RecordId>, StoreError> {
+    fn list(
+        &self,
+        shelf: Shelf,
+        after: Option<&RecordId>,
+        limit: usize,
+    ) -> Result<Vec<RecordId>, StoreError> {
+        let root = self.shelf(shelf);
         let from = after.map(|id| hex(id)).unwrap_or_default();
         let mut ids = Vec::new();
-        for folder in sorted_names(&self.records)? {
+        for folder in sorted_names(&root)? {
             if folder.len() != 2 || from.get(..2).is_some_and(|first| folder.as_str() < first) {
                 continue;
             }
-            for name in sorted_names(&self.records.join(&folder))? {
+            for name in sorted_names(&root.join(&folder))? {
                 if ids.len() == limit {
                     return Ok(ids);
                 }
@@ -203,17 +223,19 @@ mod tests {
     use super::*;
 
     const ID: RecordId = [0x3c; 32];
+    const SHELF: Shelf = Shelf::Plans;
 
     fn store_with_a_record() -> (tempfile::TempDir, DirectoryStore, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
         let store = DirectoryStore::open(folder.path()).unwrap();
-        store.put_if_absent(&ID, Bytes::from_static(b"what was thought long ago")).unwrap();
-        let path = store.path(&ID);
+        let bytes = Bytes::from_static(b"what was thought long ago");
+        store.put_if_absent(SHELF, &ID, bytes).unwrap();
+        let path = store.path(SHELF, &ID);
         (folder, store, path)
     }
 
     fn damage(store: &DirectoryStore) -> String {
-        match store.get(&ID) {
+        match store.get(SHELF, &ID) {
             Err(StoreError::Damaged { id, what }) => {
                 assert_eq!(id, hex(&ID));
                 what.to_owned()
@@ -227,8 +249,8 @@ mod tests {
         let (folder, store, _) = store_with_a_record();
         drop(store);
         let store = DirectoryStore::open(folder.path()).unwrap();
-        assert_eq!(store.get(&ID).unwrap().as_deref(), Some(&b"what was thought long ago"[..]));
-        assert_eq!(store.list(None, 9).unwrap(), [ID]);
+        assert_eq!(store.get(SHELF, &ID).unwrap().as_deref(), Some(&b"what was thought long ago"[..]));
+        assert_eq!(store.list(SHELF, None, 9).unwrap(), [ID]);
     }
 
     #[test]
@@ -240,7 +262,7 @@ mod tests {
             damage(&store);
         }
         fs::write(&path, &good).unwrap();
-        assert!(store.get(&ID).unwrap().is_some());
+        assert!(store.get(SHELF, &ID).unwrap().is_some());
     }
 
     #[test]

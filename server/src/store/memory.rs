@@ -8,7 +8,7 @@ use std::{
 
 use bytes::Bytes;
 
-use super::{ArtifactStore, Put, RecordId, StoreError};
+use super::{Put, RecordId, RecordStore, Shelf, StoreError};
 
 /// A bounded store in memory. When full it refuses new records rather than forgetting old ones:
 /// an id that was handed out stays good for the life of the process.
@@ -21,7 +21,7 @@ pub(crate) struct MemoryStore {
 #[derive(Debug, Default)]
 struct Records {
     bytes: usize,
-    by_id: BTreeMap<RecordId, Bytes>,
+    by_id: BTreeMap<(Shelf, RecordId), Bytes>,
 }
 
 impl MemoryStore {
@@ -36,10 +36,10 @@ impl MemoryStore {
     }
 }
 
-impl ArtifactStore for MemoryStore {
-    fn put_if_absent(&self, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError> {
+impl RecordStore for MemoryStore {
+    fn put_if_absent(&self, shelf: Shelf, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError> {
         let mut records = self.records();
-        if let Some(existing) = records.by_id.get(id) {
+        if let Some(existing) = records.by_id.get(&(shelf, *id)) {
             return Ok(Put::Existing(existing.clone()));
         }
         let total = records.bytes + bytes.len();
@@ -50,18 +50,27 @@ impl ArtifactStore for MemoryStore {
             )));
         }
         records.bytes = total;
-        records.by_id.insert(*id, bytes);
+        records.by_id.insert((shelf, *id), bytes);
         Ok(Put::Created)
     }
 
-    fn get(&self, id: &RecordId) -> Result<Option<Bytes>, StoreError> {
-        Ok(self.records().by_id.get(id).cloned())
+    fn get(&self, shelf: Shelf, id: &RecordId) -> Result<Option<Bytes>, StoreError> {
+        Ok(self.records().by_id.get(&(shelf, *id)).cloned())
     }
 
-    fn list(&self, after: Option<&RecordId>, limit: usize) -> Result<Vec<RecordId>, StoreError> {
-        let from = after.map_or(Bound::Unbounded, |id| Bound::Excluded(*id));
+    fn list(
+        &self,
+        shelf: Shelf,
+        after: Option<&RecordId>,
+        limit: usize,
+    ) -> Result<Vec<RecordId>, StoreError> {
+        let from = match after {
+            None => Bound::Included((shelf, [0; 32])),
+            Some(id) => Bound::Excluded((shelf, *id)),
+        };
+        let to = Bound::Included((shelf, [0xff; 32]));
         let records = self.records();
-        Ok(records.by_id.range((from, Bound::Unbounded)).take(limit).map(|(id, _)| *id).collect())
+        Ok(records.by_id.range((from, to)).take(limit).map(|((_, id), _)| *id).collect())
     }
 }
 
@@ -72,7 +81,9 @@ mod tests {
     #[test]
     fn memory_store_full_refuses_and_keeps_what_it_has() {
         let store = MemoryStore::new(10);
-        let put = |n: u8, size| store.put_if_absent(&[n; 32], vec![n; size].into());
+        let put = |n: u8, size| {
+            store.put_if_absent(Shelf::Artifacts, &[n; 32], vec![n; size].into())
+        };
         assert_eq!(put(1, 8).unwrap(), Put::Created);
         assert!(matches!(put(2, 3), Err(StoreError::Full(_))));
         assert_eq!(put(3, 2).unwrap(), Put::Created);

@@ -1,4 +1,4 @@
-//! Where artifacts are kept: bytes under ids, created once, never changed.
+//! Where artifacts and plans are kept: bytes under ids, created once, never changed.
 //!
 //! One contract, two back-ends, one conformance suite (below) that both pass. The store knows
 //! nothing of what the bytes mean.
@@ -16,23 +16,37 @@ pub(crate) use memory::MemoryStore;
 /// Names one record.
 pub(crate) type RecordId = [u8; 32];
 
+/// Kinds of records, kept apart: the same id may stand on two shelves and mean two things.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) enum Shelf {
+    /// What precomputes made, under the id of the problem.
+    Artifacts,
+    /// Plans to fly, under the digest of their content.
+    Plans,
+}
+
 /// Keeps records.
 ///
 /// Contract: a record is created whole or not at all; once `put_if_absent` has answered, `get`
 /// gives exactly those bytes or an error that says why not; nothing ever replaces them.
 /// Calls may block on a disk: call them where that is allowed.
-pub(crate) trait ArtifactStore: Debug + Send + Sync {
+pub(crate) trait RecordStore: Debug + Send + Sync {
     /// Creates the record unless it exists; answers what is there already.
-    fn put_if_absent(&self, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError>;
+    fn put_if_absent(&self, shelf: Shelf, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError>;
 
     /// The record, verified against its digest; `None` if there is none.
-    fn get(&self, id: &RecordId) -> Result<Option<Bytes>, StoreError>;
+    fn get(&self, shelf: Shelf, id: &RecordId) -> Result<Option<Bytes>, StoreError>;
 
     /// Up to `limit` ids above `after`, in ascending order.
-    fn list(&self, after: Option<&RecordId>, limit: usize) -> Result<Vec<RecordId>, StoreError>;
+    fn list(
+        &self,
+        shelf: Shelf,
+        after: Option<&RecordId>,
+        limit: usize,
+    ) -> Result<Vec<RecordId>, StoreError>;
 }
 
-/// What came of [`ArtifactStore::put_if_absent`].
+/// What came of [`RecordStore::put_if_absent`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Put {
     /// The record is new.
@@ -73,12 +87,25 @@ mod tests {
         id
     }
 
-    /// Every back-end keeps the contract.
-    fn check_conformance(store: &dyn ArtifactStore) {
-        assert_eq!(store.get(&id(1)).unwrap(), None);
-        assert_eq!(store.list(None, 10).unwrap(), Vec::<RecordId>::new());
+    /// Every back-end keeps the contract, on every shelf.
+    fn check_conformance(store: &dyn RecordStore) {
+        check_shelf(store, Shelf::Artifacts);
+        // What stands on one shelf is not on the other.
+        check_shelf(store, Shelf::Plans);
+        let put = |shelf, text: &'static [u8]| store.put_if_absent(shelf, &id(200), text.into());
+        assert_eq!(put(Shelf::Artifacts, b"artifact").unwrap(), Put::Created);
+        assert_eq!(put(Shelf::Plans, b"plan").unwrap(), Put::Created);
+        let get = |shelf| store.get(shelf, &id(200)).unwrap();
+        assert_eq!(get(Shelf::Artifacts).as_deref(), Some(b"artifact".as_slice()));
+        assert_eq!(get(Shelf::Plans).as_deref(), Some(b"plan".as_slice()));
+    }
 
-        let put = |n: u8, text: &'static [u8]| store.put_if_absent(&id(n), text.into()).unwrap();
+    fn check_shelf(store: &dyn RecordStore, shelf: Shelf) {
+        assert_eq!(store.get(shelf, &id(1)).unwrap(), None);
+        assert_eq!(store.list(shelf, None, 10).unwrap(), Vec::<RecordId>::new());
+
+        let put =
+            |n: u8, text: &'static [u8]| store.put_if_absent(shelf, &id(n), text.into()).unwrap();
         assert_eq!(put(2, b"two"), Put::Created);
         assert_eq!(put(9, b""), Put::Created);
         assert_eq!(put(1, b"one"), Put::Created);
@@ -86,29 +113,34 @@ mod tests {
         assert_eq!(put(2, b"two"), Put::Existing(b"two".as_slice().into()));
         assert_eq!(put(2, b"other"), Put::Existing(b"two".as_slice().into()));
 
-        assert_eq!(store.get(&id(1)).unwrap().as_deref(), Some(b"one".as_slice()));
-        assert_eq!(store.get(&id(2)).unwrap().as_deref(), Some(b"two".as_slice()));
-        assert_eq!(store.get(&id(9)).unwrap().as_deref(), Some(b"".as_slice()));
-        assert_eq!(store.get(&id(3)).unwrap(), None);
+        let get = |n: u8| store.get(shelf, &id(n)).unwrap();
+        assert_eq!(get(1).as_deref(), Some(b"one".as_slice()));
+        assert_eq!(get(2).as_deref(), Some(b"two".as_slice()));
+        assert_eq!(get(9).as_deref(), Some(b"".as_slice()));
+        assert_eq!(get(3), None);
 
-        assert_eq!(store.list(None, 10).unwrap(), [id(1), id(2), id(9)]);
-        assert_eq!(store.list(None, 2).unwrap(), [id(1), id(2)]);
-        assert_eq!(store.list(Some(&id(2)), 10).unwrap(), [id(9)]);
-        assert_eq!(store.list(Some(&id(5)), 10).unwrap(), [id(9)]);
-        assert_eq!(store.list(Some(&id(9)), 10).unwrap(), Vec::<RecordId>::new());
+        let list = |after: Option<u8>, limit: usize| {
+            store.list(shelf, after.map(id).as_ref(), limit).unwrap()
+        };
+        assert_eq!(list(None, 10), [id(1), id(2), id(9)]);
+        assert_eq!(list(None, 2), [id(1), id(2)]);
+        assert_eq!(list(Some(2), 10), [id(9)]);
+        assert_eq!(list(Some(5), 10), [id(9)]);
+        assert_eq!(list(Some(9), 10), Vec::<RecordId>::new());
 
         // Many writers, one winner, everybody sees the winner's bytes.
         let seen: Vec<_> = std::thread::scope(|scope| {
             let writers: Vec<_> = (0..8u8)
                 .map(|writer| {
                     scope.spawn(move || {
-                        store.put_if_absent(&id(100), Bytes::from(vec![writer; 1000])).unwrap()
+                        let bytes = Bytes::from(vec![writer; 1000]);
+                        store.put_if_absent(shelf, &id(100), bytes).unwrap()
                     })
                 })
                 .collect();
             writers.into_iter().map(|writer| writer.join().unwrap()).collect()
         });
-        let winner = store.get(&id(100)).unwrap().unwrap();
+        let winner = get(100).unwrap();
         assert_eq!(seen.iter().filter(|put| **put == Put::Created).count(), 1);
         for put in seen {
             assert!(put == Put::Created || put == Put::Existing(winner.clone()));

@@ -115,6 +115,12 @@ fn is_grpc(headers: &HeaderMap) -> bool {
 fn known_method(path: &str) -> &'static str {
     match path {
         "/vbar.v1.GuidanceService/ComputePlan" | "/v1/plans:compute" => "ComputePlan",
+        "/vbar.v1.GuidanceService/UploadPlan" => "UploadPlan",
+        "/vbar.v1.GuidanceService/ListPlans" => "ListPlans",
+        // Over HTTP the two share a path; the verb is not known here.
+        "/v1/plans" => "Plans",
+        "/vbar.v1.GuidanceService/GetPlan" => "GetPlan",
+        "/vbar.v1.GuidanceService/ExportPlan" => "ExportPlan",
         "/vbar.v1.GuidanceService/Precompute" | "/v1/precompute" => "Precompute",
         "/vbar.v1.GuidanceService/GetArtifact" => "GetArtifact",
         "/vbar.v1.GuidanceService/Step" | "/v1/step" => "Step",
@@ -122,6 +128,8 @@ fn known_method(path: &str) -> &'static str {
         "/vbar.v1.GuidanceService/GetServerInfo" | "/v1/info" => "GetServerInfo",
         "/healthz" | "/readyz" | "/metrics" | "/openapi.json" => "probe",
         _ if path.starts_with("/v1/artifacts/") => "GetArtifact",
+        _ if path.starts_with("/v1/plans/") && path.ends_with(":export") => "ExportPlan",
+        _ if path.starts_with("/v1/plans/") => "GetPlan",
         _ if path.starts_with("/google.longrunning.") => "Operations",
         _ if path.starts_with("/v1/operations") => "Operations",
         _ if path.starts_with("/grpc.health.") => "Health",

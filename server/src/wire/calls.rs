@@ -7,8 +7,8 @@ use vbar_guidance::{Method, control::Infeasibility};
 use vbar_proto::{google::longrunning, v1};
 
 use super::{
-    Artifact, ArtifactId, Door, ElapsedAndState, Limits, Parse, Path, PlanVerdict, Problem,
-    Provenance, Render, Step, count, types::BUILD_VERSION,
+    Artifact, ArtifactId, Candidate, Claimed, Door, ElapsedAndState, Limits, Order, Parse, Path,
+    PlanVerdict, Problem, Provenance, Render, Step, count, types::BUILD_VERSION,
 };
 
 /// Which controller decides.
@@ -16,6 +16,8 @@ use super::{
 pub(crate) enum Controller {
     /// One that a precompute made.
     Artifact(ArtifactId),
+    /// A kept plan.
+    Plan(ArtifactId),
     /// The mission itself.
     Problem(Problem),
 }
@@ -42,6 +44,9 @@ impl Parse for StepCall {
             Some(Message::Problem(problem)) => {
                 Problem::parse(problem, path.field("problem"), door).map(Controller::Problem)
             }
+            Some(Message::PlanId(id)) => {
+                ArtifactId::parse(id, path.field("plan_id"), door).map(Controller::Plan)
+            }
         };
         let measurement = door.message(&message.measurement, path.field("measurement"));
         Some(Self {
@@ -53,7 +58,7 @@ impl Parse for StepCall {
     }
 }
 
-const CONTROLLER: &str = "one of artifact_id, problem";
+const CONTROLLER: &str = "one of artifact_id, problem, plan_id";
 
 /// One message of `StepStream`.
 #[derive(Debug)]
@@ -75,6 +80,8 @@ impl Parse for StreamCall {
                 .map(|id| Some(Controller::Artifact(id))),
             Some(Message::Problem(problem)) => Problem::parse(problem, path.field("problem"), door)
                 .map(|problem| Some(Controller::Problem(problem))),
+            Some(Message::PlanId(id)) => ArtifactId::parse(id, path.field("plan_id"), door)
+                .map(|id| Some(Controller::Plan(id))),
         };
         let measurement = door.optional(&message.measurement, path.field("measurement"));
         Some(Self {
@@ -130,7 +137,8 @@ impl Render for StepAnswer {
 #[derive(Debug)]
 pub(crate) struct PlanCall {
     pub(crate) problem: Problem,
-    pub(crate) initial: ElapsedAndState,
+    /// There if the method wants it.
+    pub(crate) initial: Option<ElapsedAndState>,
     pub(crate) validate_only: bool,
 }
 
@@ -139,7 +147,14 @@ impl Parse for PlanCall {
 
     fn parse(message: &v1::ComputePlanRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
         let problem = door.message(&message.problem, path.field("problem"));
-        let initial = door.message(&message.initial, path.field("initial"));
+        let place = path.field("initial");
+        let initial = match (&message.problem, &message.initial) {
+            (Some(problem), Some(_)) if !Problem::wants_initial(problem) => {
+                door.refuse(place, "nothing: the problem has its initial state", "a measurement")
+            }
+            (Some(problem), None) if !Problem::wants_initial(problem) => Some(None),
+            (_, initial) => door.message(initial, place).map(Some),
+        };
         Some(Self { problem: problem?, initial: initial?, validate_only: message.validate_only })
     }
 }
@@ -150,6 +165,8 @@ pub(crate) struct PlanAnswer {
     pub(crate) provenance: Arc<Provenance>,
     /// `None` if only validated.
     pub(crate) outcome: Option<PlanResult>,
+    /// Of the plan, if it was kept.
+    pub(crate) plan_id: Option<ArtifactId>,
 }
 
 /// What came of a plan.
@@ -166,13 +183,183 @@ impl Render for PlanAnswer {
 
     fn render(&self) -> v1::ComputePlanResponse {
         use v1::compute_plan_response::Outcome;
-        let outcome = self.outcome.as_ref().map(|outcome| match outcome {
+        let outcome = self.outcome.as_ref().and_then(|outcome| match outcome {
             PlanResult::Decided(artifact, verdict) => artifact.render_plan(verdict),
             PlanResult::NoController(problem, why) => {
-                Outcome::Infeasible(problem.render_infeasible(why))
+                Some(Outcome::Infeasible(problem.render_infeasible(why)))
             }
         });
-        v1::ComputePlanResponse { provenance: Some(self.provenance.render()), outcome }
+        v1::ComputePlanResponse {
+            provenance: Some(self.provenance.render()),
+            outcome,
+            plan_id: self.plan_id.map(|id| id.to_string()).unwrap_or_default(),
+        }
+    }
+}
+
+/// `UploadPlan`.
+#[derive(Debug)]
+pub(crate) struct UploadCall {
+    pub(crate) candidate: Candidate,
+    pub(crate) validate_only: bool,
+}
+
+impl Parse for UploadCall {
+    type Message = v1::UploadPlanRequest;
+
+    fn parse(message: &v1::UploadPlanRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
+        use v1::upload_plan_request::Content;
+        let candidate = match &message.content {
+            None => door.refuse(path, "one of document, binary", "nothing"),
+            Some(Content::Document(document)) => {
+                Claimed::parse(document, path.field("document"), door)
+                    .map(|claimed| Candidate::Document(Box::new(claimed)))
+            }
+            Some(Content::Binary(bytes)) => Some(Candidate::Binary(bytes.clone())),
+        };
+        Some(Self { candidate: candidate?, validate_only: message.validate_only })
+    }
+}
+
+/// Answer of `UploadPlan`.
+#[derive(Debug)]
+pub(crate) struct UploadAnswer {
+    pub(crate) plan: Arc<Artifact>,
+    /// `None` if only validated.
+    pub(crate) plan_id: Option<ArtifactId>,
+}
+
+impl Render for UploadAnswer {
+    type Message = v1::UploadPlanResponse;
+
+    fn render(&self) -> v1::UploadPlanResponse {
+        v1::UploadPlanResponse {
+            plan_id: self.plan_id.map(|id| id.to_string()).unwrap_or_default(),
+            certificate: self.plan.render_plan_certificate(),
+        }
+    }
+}
+
+/// `GetPlan`.
+#[derive(Debug)]
+pub(crate) struct KeptPlanCall {
+    pub(crate) id: ArtifactId,
+}
+
+impl Parse for KeptPlanCall {
+    type Message = v1::GetPlanRequest;
+
+    fn parse(message: &v1::GetPlanRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
+        ArtifactId::parse(&message.plan_id, path.field("plan_id"), door).map(|id| Self { id })
+    }
+}
+
+/// A kept plan: of `GetPlan`, and a line of `ListPlans`.
+#[derive(Debug)]
+pub(crate) struct KeptPlanAnswer {
+    pub(crate) id: ArtifactId,
+    pub(crate) plan: Arc<Artifact>,
+    pub(crate) provenance: Arc<Provenance>,
+    pub(crate) size_bytes: usize,
+}
+
+impl KeptPlanAnswer {
+    fn line(&self) -> v1::PlanSummary {
+        v1::PlanSummary {
+            plan_id: self.id.to_string(),
+            method: self.plan.method().name().to_owned(),
+            size_bytes: i64::try_from(self.size_bytes).unwrap_or(i64::MAX),
+            ..self.plan.render_line().unwrap_or_default()
+        }
+    }
+}
+
+impl Render for KeptPlanAnswer {
+    type Message = v1::GetPlanResponse;
+
+    fn render(&self) -> v1::GetPlanResponse {
+        v1::GetPlanResponse {
+            plan_id: self.id.to_string(),
+            document: self.plan.render_document(),
+            provenance: Some(self.provenance.render()),
+        }
+    }
+}
+
+/// `ListPlans`.
+#[derive(Debug)]
+pub(crate) struct PlansCall {
+    pub(crate) page_size: usize,
+    pub(crate) after: Option<ArtifactId>,
+}
+
+/// Plans on one page unless asked for fewer: each is read and checked again.
+const PLANS_PAGE_SIZE: usize = 50;
+
+impl Parse for PlansCall {
+    type Message = v1::ListPlansRequest;
+
+    fn parse(message: &v1::ListPlansRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
+        let page_size = page_size(message.page_size, PLANS_PAGE_SIZE, path, door);
+        let after = page_token(&message.page_token, path, door);
+        Some(Self { page_size: page_size?, after: after? })
+    }
+}
+
+/// AIP-158: 0 means the default, more than the most is cut to it.
+fn page_size(given: i32, most: usize, path: Path<'_>, door: &mut Door) -> Option<usize> {
+    match usize::try_from(given) {
+        Ok(0) => Some(most),
+        Ok(size) => Some(size.min(most)),
+        Err(_) => door.refuse(path.field("page_size"), "at least 0", given),
+    }
+}
+
+/// A token is the id that the page before it ended with.
+#[allow(clippy::option_option, reason = "absent and wrong are different things here")]
+fn page_token(token: &str, path: Path<'_>, door: &mut Door) -> Option<Option<ArtifactId>> {
+    if token.is_empty() {
+        return Some(None);
+    }
+    ArtifactId::from_hex(token).map(Some).or_else(|| {
+        let shown: String = token.chars().take(100).collect();
+        let expected = "a token from an earlier page";
+        door.refuse(path.field("page_token"), expected, format!("{shown:?}"))
+    })
+}
+
+/// Answer of `ListPlans`.
+#[derive(Debug)]
+pub(crate) struct PlansAnswer {
+    pub(crate) plans: Vec<KeptPlanAnswer>,
+    pub(crate) next: Option<ArtifactId>,
+}
+
+impl Render for PlansAnswer {
+    type Message = v1::ListPlansResponse;
+
+    fn render(&self) -> v1::ListPlansResponse {
+        v1::ListPlansResponse {
+            plans: self.plans.iter().map(KeptPlanAnswer::line).collect(),
+            next_page_token: self.next.map(|id| id.to_string()).unwrap_or_default(),
+        }
+    }
+}
+
+/// `ExportPlan`.
+#[derive(Debug)]
+pub(crate) struct ExportCall {
+    pub(crate) id: ArtifactId,
+    pub(crate) order: Order,
+}
+
+impl Parse for ExportCall {
+    type Message = v1::ExportPlanRequest;
+
+    fn parse(message: &v1::ExportPlanRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
+        let id = ArtifactId::parse(&message.plan_id, path.field("plan_id"), door);
+        let order = Order::parse(message, path, door);
+        Some(Self { id: id?, order: order? })
     }
 }
 
@@ -377,19 +564,8 @@ impl Parse for OperationsCall {
             "" => Some(()),
             other => refuse("filter", "nothing: filters are not offered", other),
         };
-        let after = match message.page_token.as_str() {
-            "" => Some(None),
-            token => match ArtifactId::from_hex(token) {
-                Some(id) => Some(Some(id)),
-                None => refuse("page_token", "a token from an earlier page", token).map(|()| None),
-            },
-        };
-        // AIP-158: 0 means the default, more than the most is cut to it.
-        let page_size = match usize::try_from(message.page_size) {
-            Ok(0) => Some(PAGE_SIZE),
-            Ok(size) => Some(size.min(PAGE_SIZE)),
-            Err(_) => door.refuse(path.field("page_size"), "at least 0", message.page_size),
-        };
+        let after = page_token(&message.page_token, path, door);
+        let page_size = page_size(message.page_size, PAGE_SIZE, path, door);
         collection?;
         filter?;
         Some(Self { page_size: page_size?, after: after? })
@@ -454,6 +630,7 @@ impl Render for InfoAnswer {
                 inputs_max: count(self.limits.inputs_max),
                 steps_max: count(self.limits.steps_max),
                 polytope_rows_max: count(self.limits.polytope_rows_max),
+                plan_instants_max: count(self.limits.plan_instants_max),
                 concurrent_computations_max: count(self.compute_threads),
                 computation_time_max_s: self.computation_time_max.as_secs_f64(),
             }),

@@ -6,20 +6,29 @@
 
 mod calls;
 mod controller_state;
+mod disturbance_feedback;
+mod export;
 mod methods;
+mod orbits;
 mod types;
 mod variable_horizon;
 
 use std::fmt;
 
 pub(crate) use calls::{
-    ArtifactAnswer, ArtifactCall, Controller, DecidedStep, InfoAnswer, InfoCall, NamedBy,
-    OperationAnswer, OperationName, OperationsAnswer, OperationsCall, PlanAnswer, PlanCall,
-    PlanResult, PrecomputeCall, StepAnswer, StepCall, StreamCall,
+    ArtifactAnswer, ArtifactCall, Controller, DecidedStep, ExportCall, InfoAnswer, InfoCall,
+    KeptPlanAnswer, KeptPlanCall, NamedBy, OperationAnswer, OperationName, OperationsAnswer,
+    OperationsCall, PlanAnswer, PlanCall, PlanResult, PlansAnswer, PlansCall, PrecomputeCall,
+    StepAnswer, StepCall, StreamCall, UploadAnswer, UploadCall,
 };
 pub(crate) use controller_state::{ControllerState, StateFault};
-pub(crate) use methods::{Artifact, PlanVerdict, Problem, SolverWork, State, Step, VerdictKind};
+pub(crate) use disturbance_feedback::Claimed;
+pub(crate) use export::{Document, Missing, Order, read_ocm_burns};
+pub(crate) use methods::{
+    Artifact, Candidate, PlanVerdict, Problem, SolverWork, State, Step, VerdictKind,
+};
 pub(crate) use types::{ArtifactId, ElapsedAndState, Provenance};
+pub(crate) use vbar_guidance::control::disturbance_feedback::INSTANTS_MAX as PLAN_INSTANTS_MAX;
 
 /// Limits on what a request may ask for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,11 +45,13 @@ pub struct Limits {
     pub steps_max: usize,
     /// Most rows of a polytope.
     pub polytope_rows_max: usize,
+    /// Most instants of a plan with disturbance feedback.
+    pub plan_instants_max: usize,
 }
 
 impl Default for Limits {
-    /// Well above the published missions (horizon 122, 6 states, 12 generators), well below what
-    /// would occupy a compute thread for minutes.
+    /// Well above the published missions (horizon 122, 6 states, 12 generators, 20 instants), well
+    /// below what would occupy a compute thread for minutes.
     fn default() -> Self {
         Self {
             horizon_max: 500,
@@ -49,6 +60,7 @@ impl Default for Limits {
             inputs_max: 6,
             steps_max: 10_000,
             polytope_rows_max: 64,
+            plan_instants_max: PLAN_INSTANTS_MAX,
         }
     }
 }

@@ -134,7 +134,7 @@ impl Parse for ElapsedAndState {
     }
 }
 
-fn relative_state(
+pub(super) fn relative_state(
     message: &v1::RelativeState,
     path: Path<'_>,
     door: &mut Door,
@@ -369,6 +369,26 @@ fn render_family(family: ConstraintFamily) -> i32 {
     family.into()
 }
 
+/// What a method's amounts of infeasibility are measured in.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Units {
+    /// Metres in one unit of a state constraint, for spacecraft plants.
+    position_unit_m: Option<f64>,
+    /// Metres per second in one unit of an input constraint, where inputs are impulses.
+    impulse_unit_m_s: Option<f64>,
+}
+
+impl Units {
+    /// Amounts of impulses are in m/s.
+    pub(super) const IMPULSES: Self =
+        Self { position_unit_m: None, impulse_unit_m_s: Some(1.0) };
+
+    /// Scaled amounts; `position_unit_m` is metres in one unit of position.
+    pub(super) fn scaled(position_unit_m: Option<f64>) -> Self {
+        Self { position_unit_m, impulse_unit_m_s: None }
+    }
+}
+
 /// Only state constraints of a spacecraft plant are half-spaces of position, hence metres.
 fn in_metres(family: ConstraintFamily, amount: f64, position_unit_m: Option<f64>) -> Option<f64> {
     match family {
@@ -414,10 +434,10 @@ pub(super) fn render_certificate(
     }
 }
 
-/// `position_unit_m`: metres in one unit of scaled position, for spacecraft plants.
+/// Writes why there is no answer.
 pub(super) fn render_infeasible(
     infeasibility: &Infeasibility,
-    position_unit_m: Option<f64>,
+    units: Units,
 ) -> v1::Infeasible {
     let row = |r: &control::ProofRow| v1::ConstraintRow {
         family: render_family(r.family),
@@ -429,7 +449,11 @@ pub(super) fn render_infeasible(
         family: render_family(r.family),
         horizon: count(r.horizon),
         amount_nd: r.amount,
-        amount_m: in_metres(r.family, r.amount, position_unit_m),
+        amount_m: in_metres(r.family, r.amount, units.position_unit_m),
+        amount_m_s: match r.family {
+            ConstraintFamily::Input => units.impulse_unit_m_s.map(|unit| r.amount * unit),
+            _ => None,
+        },
     };
     v1::Infeasible {
         reason: infeasibility.reason.clone(),

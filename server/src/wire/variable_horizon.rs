@@ -6,6 +6,7 @@ use vbar_guidance::{
     control::variable_horizon::{self as method, Branch, Plan, Step, TrialOutcome, Verdict},
     dynamics::HillScaling,
     mission::{BodyMotion, DisturbanceSet, DockingCone, RateReference, TargetMotion, TargetSample},
+    orbit::{EARTH_MU_M3_S2, EARTH_RADIUS_M},
     sets::Zonotope,
     units::{Acceleration, Angle, Mass, Seconds},
 };
@@ -14,16 +15,12 @@ use vbar_proto::v1::{self, variable_horizon_problem::Plant as PlantMessage};
 use super::{
     Door, Parse, Path, count,
     types::{
-        Axes, ElapsedAndState, MeasuredState, Size, integer, list, matrix, not_negative, number,
+        Axes, ElapsedAndState, MeasuredState, Size, Units, integer, list, matrix, not_negative, number,
         polytope, positive, render_certificate, render_infeasible, render_matrix, render_vectors,
         unknown_enum, vector, vector3,
     },
 };
 
-/// Gravitational parameter of the Earth, m^3/s^2 (EGM96, as in the published missions).
-const EARTH_MU_M3_S2: f64 = 3.986_004_418e14;
-/// Equatorial radius of the Earth, m (WGS 84): no orbit has a smaller one.
-const EARTH_RADIUS_M: f64 = 6_378_137.0;
 /// Steps of a mission that does not say how long it may take.
 const STEPS_MAX_DEFAULT: usize = 1000;
 /// State components and inputs of the Hill plant.
@@ -802,7 +799,7 @@ pub(super) fn render_step(
             deviation_norm_nd: arrival.deviation_norm,
             inside_guaranteed_set: arrival.inside_guaranteed_set,
         }),
-        Verdict::Infeasible(why) => Message::Infeasible(render_infeasible(why, unit)),
+        Verdict::Infeasible(why) => Message::Infeasible(render_infeasible(why, Units::scaled(unit))),
     };
     let trajectory = step.trajectory.as_ref().filter(|_| !omit_prediction);
     v1::StepResponse {
@@ -831,6 +828,7 @@ pub(super) fn render_plan(artifact: &method::Artifact, plan: &Plan) -> v1::Plan 
         }),
         certificate: Some(render_certificate(&plan.certificate, unit)),
         variable_horizon: Some(render_diagnostics(&plan.diagnostics)),
+        disturbance_feedback: None,
     }
 }
 
@@ -848,6 +846,7 @@ fn render_command(command: &method::Command) -> v1::Command {
         force_n: command.force.iter().flatten().map(|f| f.newtons()).collect(),
         input_nd: command.input.iter().copied().collect(),
         last: command.last,
+        ..v1::Command::default()
     }
 }
 

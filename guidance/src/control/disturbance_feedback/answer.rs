@@ -64,7 +64,7 @@ pub struct Arrival {
     pub distance_m: f64,
     /// |x - x_f|_2 of the measured state, scaled variables.
     pub deviation_norm: f64,
-    /// e' Q_f^-1 e in the problem's metric [Deaconu2014, eq. 21]: at most 1 inside.
+    /// sqrt(e' Q_f^-1 e) in the problem's metric [Deaconu2014, eq. 21]: at most 1 inside.
     pub level: f64,
     /// The level is at most 1: the measured state lies in the arrival set that was guaranteed.
     pub inside_guaranteed_set: bool,

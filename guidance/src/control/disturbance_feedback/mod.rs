@@ -1,7 +1,12 @@
 //! Fixed-time rendezvous plans with disturbance feedback.
 
 mod answer;
+mod conic;
+mod design;
 mod encoding;
+mod flight;
+mod model;
+mod outcome;
 mod plan;
 mod problem;
 mod state;
@@ -9,15 +14,15 @@ mod state;
 pub use answer::{
     Arrival, BurnCommand, Diagnostics, Measurement, RealisedDisturbance, Step, Verdict,
 };
-pub use plan::{
-    ArrivalSet, BurnBounds, Gain, Origin, Outcome, Plan, PlanCertificate, PlannedState,
-};
+pub use model::{LinearModel, LowerBound};
+pub use outcome::{ArrivalSet, BurnBounds, Outcome, PlanCertificate, PlannedState};
+pub use plan::{Gain, Origin, Plan};
 pub use problem::{
     ArrivalMetric, EFFORT_WEIGHT_DEFAULT, FUEL_WEIGHT_DEFAULT, INSTANTS_MAX, Instants, Problem,
 };
 pub use state::State;
 
-use super::{Controller, Failure, PrepareError, StepError};
+use super::{Controller, PrepareError, StepError};
 use crate::budget::Budget;
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
@@ -66,8 +71,7 @@ impl Controller for DisturbanceFeedback {
         budget: Budget<'_>,
     ) -> Result<Step, StepError> {
         budget.check()?;
-        let _ = (artifact, state, measurement);
-        Err(Failure::Numerical("not on this branch yet".into()).into())
+        flight::step(artifact, state, measurement)
     }
 }
 
@@ -78,20 +82,14 @@ impl Controller for DisturbanceFeedback {
 /// state (half a revolution apart); [`PrepareError::Infeasible`] with the least `delta_v_max_m_s`
 /// if the limit is too low; [`PrepareError::Failure`] when interrupted or defeated by numbers.
 pub fn plan(problem: &Problem, budget: Budget<'_>) -> Result<Plan, PrepareError> {
-    budget.check()?;
-    let faults = problem.faults();
-    if !faults.is_empty() {
-        return Err(PrepareError::Faults(faults));
-    }
-    Err(Failure::Numerical("not on this branch yet".into()).into())
+    design::design(problem, budget)
 }
 
 /// Least `delta_v_max_m_s` for which a plan exists (gains of zero cost no margin, so this is a
 /// matter of the nominal burns); `None` if no limit would do.
 ///
 /// # Errors
-/// The problem's faults.
-pub fn least_delta_v_max_m_s(problem: &Problem) -> Result<Option<f64>, Vec<super::Fault>> {
-    let faults = problem.faults();
-    if faults.is_empty() { Ok(None) } else { Err(faults) }
+/// The problem's faults, and a disturbance set that rounding has destroyed.
+pub fn least_delta_v_max_m_s(problem: &Problem) -> Result<Option<f64>, PrepareError> {
+    Ok(LinearModel::of(problem)?.least_limit().map(|(limit, _)| limit))
 }

@@ -31,6 +31,44 @@ impl GuidanceService for Grpc {
             .map(|timed| respond(timed.map(|answer| answer.render())))
     }
 
+    async fn upload_plan(
+        &self,
+        request: Request<v1::UploadPlanRequest>,
+    ) -> Result<Response<v1::UploadPlanResponse>, Status> {
+        self.call(request, async |service: &Service, ask, call| service.upload(ask, &call).await)
+            .await
+            .map(|timed| respond(timed.map(|answer| answer.render())))
+    }
+
+    async fn get_plan(
+        &self,
+        request: Request<v1::GetPlanRequest>,
+    ) -> Result<Response<v1::GetPlanResponse>, Status> {
+        self.call(request, async |service: &Service, ask, call| service.kept_plan(ask, &call).await)
+            .await
+            .map(|answer| Response::new(answer.render()))
+    }
+
+    async fn list_plans(
+        &self,
+        request: Request<v1::ListPlansRequest>,
+    ) -> Result<Response<v1::ListPlansResponse>, Status> {
+        self.call(request, async |service: &Service, ask, call| {
+            service.kept_plans(ask, &call).await
+        })
+        .await
+        .map(|answer| Response::new(answer.render()))
+    }
+
+    async fn export_plan(
+        &self,
+        request: Request<v1::ExportPlanRequest>,
+    ) -> Result<Response<v1::ExportPlanResponse>, Status> {
+        self.call(request, async |service: &Service, ask, call| service.export(ask, &call).await)
+            .await
+            .map(|timed| respond(timed.map(|answer| answer.render())))
+    }
+
     async fn precompute(
         &self,
         request: Request<v1::PrecomputeRequest>,

@@ -22,7 +22,7 @@ use super::{SERVER_TIMING, TransportOptions, deadline_fault, server_timing};
 use crate::{
     service::{Call, Code, Error, Service, Timed},
     telemetry::RequestId,
-    wire::{NamedBy, Parse, Render, parse},
+    wire::{Document, NamedBy, Parse, Render, parse},
 };
 use errors::HttpError;
 
@@ -54,6 +54,8 @@ pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Rout
     });
     Router::new()
         .route("/v1/plans:compute", post(compute_plan))
+        .route("/v1/plans", get(list_plans).post(upload_plan))
+        .route("/v1/plans/{id}", get(kept_plan))
         .route("/v1/precompute", post(precompute))
         .route("/v1/operations", get(list_operations))
         .route("/v1/operations/{id}", any(operation))
@@ -72,6 +74,52 @@ async fn compute_plan(State(http): Shared, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, body)| {
         let (ask, call) = http.message::<_, v1::ComputePlanRequest>(&parts, body).await?;
         Ok(timed(http.service.plan(ask, &call).await?))
+    })
+    .await
+}
+
+async fn upload_plan(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, body)| {
+        let (ask, call) = http.message::<_, v1::UploadPlanRequest>(&parts, body).await?;
+        Ok(timed(http.service.upload(ask, &call).await?))
+    })
+    .await
+}
+
+async fn list_plans(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, _)| {
+        let mut message = v1::ListPlansRequest::default();
+        for (name, value) in query(&parts) {
+            match name {
+                "pageSize" | "page_size" => message.page_size = page_size(&value)?,
+                "pageToken" | "page_token" => message.page_token = value,
+                _ => return Err(Error::field("query", "pageSize, pageToken", name).into()),
+            }
+        }
+        let (ask, call) = http.parsed(&parts, &message)?;
+        Ok(rendered(&http.service.kept_plans(ask, &call).await?))
+    })
+    .await
+}
+
+/// `GET /v1/plans/{id}` and `GET /v1/plans/{id}:export`.
+///
+/// The router takes whole segments only, so the verb is told apart here.
+async fn kept_plan(
+    State(http): Shared,
+    Path(segment): Path<String>,
+    request: Request,
+) -> Response {
+    http.call(request, async |http: &Http, (parts, _)| match segment.strip_suffix(":export") {
+        None => {
+            no_query(&parts)?;
+            let (ask, call) = http.parsed(&parts, &v1::GetPlanRequest { plan_id: segment })?;
+            Ok(rendered(&http.service.kept_plan(ask, &call).await?))
+        }
+        Some(id) => {
+            let (ask, call) = http.parsed(&parts, &export_request(id, &parts)?)?;
+            Ok(document(http.service.export(ask, &call).await?))
+        }
     })
     .await
 }
@@ -116,7 +164,7 @@ async fn info(State(http): Shared, request: Request) -> Response {
 
 async fn list_operations(State(http): Shared, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, _)| {
-        let message = list_request(parts.uri.query().unwrap_or_default())?;
+        let message = list_request(&parts)?;
         let (ask, call) = http.parsed(&parts, &message)?;
         Ok(rendered(&http.service.operations(ask, &call).await?))
     })
@@ -316,22 +364,48 @@ fn no_query(parts: &Parts) -> Result<(), HttpError> {
     }
 }
 
+/// Names and values of a query; `%xx` and `+` are decoded in values, names have neither.
+fn query(parts: &Parts) -> Vec<(&str, String)> {
+    let pairs = parts.uri.query().unwrap_or_default().split('&').filter(|pair| !pair.is_empty());
+    pairs
+        .map(|pair| {
+            let (name, value) = pair.split_once('=').unwrap_or((pair, ""));
+            (name, decoded(value))
+        })
+        .collect()
+}
+
+/// A value of a query as it was meant; what is no `%xx` stays as it is and is refused later.
+fn decoded(value: &str) -> String {
+    let mut bytes = Vec::with_capacity(value.len());
+    let mut rest = value.as_bytes();
+    while let Some((&first, after)) = rest.split_first() {
+        let digit = |c: &u8| char::from(*c).to_digit(16).and_then(|d| u8::try_from(d).ok());
+        let escaped = match (first, after) {
+            (b'%', [high, low, ..]) => digit(high).zip(digit(low)).map(|(h, l)| h << 4 | l),
+            _ => None,
+        };
+        rest = if escaped.is_some() { &after[2..] } else { after };
+        bytes.push(escaped.unwrap_or(if first == b'+' { b' ' } else { first }));
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
+fn page_size(value: &str) -> Result<i32, HttpError> {
+    value.parse().map_err(|_| Error::field("page_size", "an integer, at least 0", value).into())
+}
+
 /// `?pageSize=…&pageToken=…&filter=…`, also in snake case.
-fn list_request(query: &str) -> Result<longrunning::ListOperationsRequest, HttpError> {
+fn list_request(parts: &Parts) -> Result<longrunning::ListOperationsRequest, HttpError> {
     let mut message = longrunning::ListOperationsRequest {
         name: "operations".to_owned(),
         ..longrunning::ListOperationsRequest::default()
     };
-    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
-        let (name, value) = pair.split_once('=').unwrap_or((pair, ""));
+    for (name, value) in query(parts) {
         match name {
-            "pageSize" | "page_size" => {
-                message.page_size = value
-                    .parse()
-                    .map_err(|_| Error::field("page_size", "an integer, at least 0", value))?;
-            }
-            "pageToken" | "page_token" => message.page_token = value.to_owned(),
-            "filter" => message.filter = value.to_owned(),
+            "pageSize" | "page_size" => message.page_size = page_size(&value)?,
+            "pageToken" | "page_token" => message.page_token = value,
+            "filter" => message.filter = value,
             _ => {
                 let expected = "pageSize, pageToken, filter";
                 return Err(Error::field("query", expected, name).into());
@@ -339,4 +413,61 @@ fn list_request(query: &str) -> Result<longrunning::ListOperationsRequest, HttpE
         }
     }
     Ok(message)
+}
+
+/// `?format=CCSDS_OEM&chaserName=…`, the fields of the message, also in snake case; the format
+/// with or without `PLAN_FORMAT_`.
+fn export_request(id: &str, parts: &Parts) -> Result<v1::ExportPlanRequest, HttpError> {
+    let mut message =
+        v1::ExportPlanRequest { plan_id: id.to_owned(), ..v1::ExportPlanRequest::default() };
+    for (name, value) in query(parts) {
+        match name {
+            "format" => message.format = plan_format(&value)?.into(),
+            "chaserName" | "chaser_name" => message.chaser_name = value,
+            "targetName" | "target_name" => message.target_name = value,
+            "chaserDesignator" | "chaser_designator" => message.chaser_designator = value,
+            "originator" => message.originator = value,
+            "creationDate" | "creation_date" => message.creation_date = value,
+            _ => {
+                let expected = "format, chaserName, targetName, chaserDesignator, originator, \
+                                creationDate";
+                return Err(Error::field("query", expected, name).into());
+            }
+        }
+    }
+    Ok(message)
+}
+
+fn plan_format(value: &str) -> Result<v1::PlanFormat, HttpError> {
+    let full = format!("PLAN_FORMAT_{value}");
+    v1::PlanFormat::from_str_name(value).or_else(|| v1::PlanFormat::from_str_name(&full)).ok_or_else(
+        || Error::field("format", "CCSDS_OCM, CCSDS_OEM, CSV or BINARY", value).into(),
+    )
+}
+
+/// The document itself, under its own media type.
+fn document(made: Timed<Document>) -> Response {
+    let Timed { value, compute } = made;
+    let mut response = ([(header::CONTENT_TYPE, value.content_type)], value.content).into_response();
+    let headers = response.headers_mut();
+    let name = format!("attachment; filename=\"{}\"", value.file_name);
+    if let Ok(name) = HeaderValue::from_str(&name) {
+        headers.insert(header::CONTENT_DISPOSITION, name);
+    }
+    headers.insert(SERVER_TIMING, server_timing(compute));
+    response
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn query_values_are_decoded_once() {
+        assert_eq!(decoded("A%20B+C%2fD"), "A B C/D");
+        assert_eq!(decoded("%2520"), "%20");
+        for malformed in ["%", "%2", "%zz"] {
+            assert_eq!(decoded(malformed), malformed);
+        }
+    }
 }

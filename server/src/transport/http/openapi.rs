@@ -23,8 +23,12 @@ enum Body {
     Optional,
 }
 
-const ROUTES: [Route; 10] = [
+const ROUTES: [Route; 14] = [
     route("post", "/v1/plans:compute", "vbar.v1.GuidanceService.ComputePlan", Body::Required),
+    route("post", "/v1/plans", "vbar.v1.GuidanceService.UploadPlan", Body::Required),
+    bare("get", "/v1/plans", "vbar.v1.GuidanceService.ListPlans"),
+    bare("get", "/v1/plans/{id}", "vbar.v1.GuidanceService.GetPlan"),
+    bare("get", EXPORT, "vbar.v1.GuidanceService.ExportPlan"),
     route("post", "/v1/precompute", "vbar.v1.GuidanceService.Precompute", Body::Required),
     route("post", "/v1/step", "vbar.v1.GuidanceService.Step", Body::Required),
     bare("get", "/v1/info", "vbar.v1.GuidanceService.GetServerInfo"),
@@ -45,6 +49,9 @@ const ROUTES: [Route; 10] = [
         Body::Optional,
     ),
 ];
+
+/// Answered by the document itself.
+const EXPORT: &str = "/v1/plans/{id}:export";
 
 const fn route(method: &'static str, path: &'static str, rpc: &'static str, body: Body) -> Route {
     Route { method, path, rpc, body: Some(body) }
@@ -91,7 +98,7 @@ pub(super) fn document() -> Value {
                     "name": "id",
                     "in": "path",
                     "required": true,
-                    "description": "Artifact id: 64 lower-case hexadecimal digits.",
+                    "description": "Id of the artifact or plan: 64 lower-case hexadecimal digits.",
                     "schema": { "type": "string", "pattern": "^[0-9a-f]{64}$" },
                 },
             },
@@ -107,13 +114,16 @@ fn operation(route: &Route, schemas: &mut Schemas) -> Value {
     if route.path.contains("{id}") {
         parameters.push(json!({ "$ref": "#/components/parameters/id" }));
     }
-    if route.path == "/v1/operations" {
+    if route.path == "/v1/operations" || (route.path == "/v1/plans" && route.method == "get") {
         for (name, schema) in [
             ("pageSize", json!({ "type": "integer", "minimum": 0, "maximum": i32::MAX })),
             ("pageToken", json!({ "type": "string", "pattern": "^([0-9a-f]{64})?$" })),
         ] {
             parameters.push(json!({ "name": name, "in": "query", "schema": schema }));
         }
+    }
+    if route.path == EXPORT {
+        parameters.extend(export_parameters());
     }
     let comments = Comments::of(&rpc.parent_file());
     let mut operation = json!({
@@ -131,6 +141,21 @@ fn operation(route: &Route, schemas: &mut Schemas) -> Value {
     operation
 }
 
+/// The fields of the message that go into the query.
+fn export_parameters() -> Vec<Value> {
+    let formats = ["CCSDS_OCM", "CCSDS_OEM", "CSV", "BINARY"];
+    let text = || json!({ "type": "string", "maxLength": 64 });
+    let mut parameters = vec![json!({
+        "name": "format", "in": "query", "required": true,
+        "schema": { "type": "string", "enum": formats },
+    })];
+    let names = ["chaserName", "targetName", "chaserDesignator", "originator", "creationDate"];
+    for name in names {
+        parameters.push(json!({ "name": name, "in": "query", "schema": text() }));
+    }
+    parameters
+}
+
 fn responses(route: &Route, answer: Value) -> Value {
     let mut responses = Map::new();
     let mut add = |code: &str, description: &str, schema: &Value| {
@@ -138,7 +163,9 @@ fn responses(route: &Route, answer: Value) -> Value {
         responses
             .insert(code.to_owned(), json!({ "description": description, "content": content }));
     };
-    add("200", "The answer; an infeasible problem is one too.", &answer);
+    if route.path != EXPORT {
+        add("200", "The answer; an infeasible problem is one too.", &answer);
+    }
     let status = json!({ "$ref": "#/components/schemas/google.rpc.Status" });
     let mut errors = vec![
         ("400", "The request is at fault; every faulty field is named."),
@@ -149,7 +176,7 @@ fn responses(route: &Route, answer: Value) -> Value {
         ("504", "No certified answer was found before the deadline."),
     ];
     if route.path.contains("{id}") || route.path == "/v1/step" {
-        errors.push(("404", "There is no such artifact or operation."));
+        errors.push(("404", "There is no such artifact, plan or operation."));
     }
     if route.body.is_some() {
         errors.push(("408", "The body did not arrive in time."));
@@ -161,6 +188,16 @@ fn responses(route: &Route, answer: Value) -> Value {
     }
     for (code, description) in errors {
         add(code, description, &status);
+    }
+    if route.path == EXPORT {
+        let document = json!({ "schema": { "type": "string" } });
+        let content = json!({
+            "text/plain": document,
+            "text/csv": document,
+            "application/octet-stream": document,
+        });
+        let ok = json!({ "description": "The document itself.", "content": content });
+        responses.insert("200".to_owned(), ok);
     }
     Value::Object(responses)
 }

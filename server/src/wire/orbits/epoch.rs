@@ -28,7 +28,7 @@ pub(super) struct Calendar {
 }
 
 /// What [`Calendar::read`] takes.
-pub(super) const CALENDAR: &str =
+pub(in crate::wire) const CALENDAR: &str =
     "a calendar date such as 2027-03-01T12:00:00.000, without offset, year 1972 to 2200";
 
 impl Calendar {
@@ -84,9 +84,14 @@ impl Calendar {
     }
 }
 
+/// Whether a text is a calendar of a day that exists.
+pub(in crate::wire) fn is_calendar(text: &str) -> bool {
+    Calendar::read(text).and_then(|calendar| calendar.moment(TimeSystem::Utc)).is_some()
+}
+
 /// The calendar `elapsed` after an epoch, in the epoch's own scale: nanoseconds, at least three
 /// decimals.
-pub(crate) fn calendar_after(epoch: &Epoch, elapsed: Seconds) -> String {
+pub(in crate::wire) fn calendar_after(epoch: &Epoch, elapsed: Seconds) -> String {
     let since = Duration::from_total_nanoseconds(epoch.nanoseconds_since_j2000_tai.into())
         + elapsed.seconds() * Unit::Second;
     let moment = hifitime::Epoch::from_tai_duration(j2000_tai() + since);
@@ -108,7 +113,7 @@ pub(super) fn seconds_between(from: &Epoch, to: &Epoch) -> f64 {
 }
 
 /// The name that CCSDS documents have for a scale.
-pub(crate) fn ccsds_time_system(system: TimeSystem) -> &'static str {
+pub(in crate::wire) fn ccsds_time_system(system: TimeSystem) -> &'static str {
     match system {
         TimeSystem::Utc => "UTC",
         TimeSystem::Tai => "TAI",

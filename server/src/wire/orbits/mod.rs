@@ -18,8 +18,7 @@ use super::{
     types::{self, number, unknown_enum, vector3},
 };
 
-pub(super) use epoch::{ccsds_time_system, render_epoch};
-pub(crate) use epoch::calendar_after;
+pub(super) use epoch::{CALENDAR, calendar_after, ccsds_time_system, is_calendar, render_epoch};
 
 /// The target's orbit, and when the mission starts.
 #[derive(Debug, Clone, Copy, PartialEq)]
