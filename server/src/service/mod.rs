@@ -133,6 +133,7 @@ impl Service {
         let loaded = match self.obtain(id, ask.problem, call).await? {
             Outcome::Made(loaded) => loaded,
             Outcome::Infeasible(problem, why) => {
+                self.planned("infeasible");
                 let provenance = Arc::new(provenance(method, id, String::new()));
                 let outcome = Some(PlanResult::NoController(problem, why));
                 let value = PlanAnswer { provenance, outcome, plan_id: None };
@@ -153,6 +154,7 @@ impl Service {
         if let Some(certificate) = verdict.certificate() {
             self.withhold_unless_passed(Some(certificate))?;
         }
+        self.planned(if verdict.is_infeasible() { "infeasible" } else { "computed" });
         let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
         let outcome = Some(PlanResult::Decided(loaded.artifact, verdict));
         let value = PlanAnswer { provenance: loaded.provenance, outcome, plan_id };
@@ -173,7 +175,8 @@ impl Service {
             Ok((plan, kept.transpose()?))
         };
         let timed = self.compute.run("verify", call.deadline, work).await?;
-        let (plan, kept) = timed.value?;
+        let (plan, kept) = timed.value.inspect_err(|_| self.planned("refused"))?;
+        self.planned("uploaded");
         let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
         Ok(Timed { value: UploadAnswer { plan, plan_id }, compute: timed.compute })
     }
@@ -212,7 +215,10 @@ impl Service {
         let work = move |_: Budget<'_>| plan.export(&id.to_string(), &order);
         let timed = self.compute.run("export", call.deadline, work).await?;
         match timed.value {
-            Some(Ok(value)) => Ok(Timed { value, compute: timed.compute }),
+            Some(Ok(value)) => {
+                self.planned("exported");
+                Ok(Timed { value, compute: timed.compute })
+            }
             Some(Err(missing)) => Err(Error::missing(missing)),
             None => Err(Error::internal("NOT_A_PLAN", &id.to_string())),
         }
@@ -361,9 +367,7 @@ impl Service {
             Controller::Artifact(id) => {
                 self.load(Shelf::Artifacts, id, call).await.map(Found::Controller)
             }
-            Controller::Plan(id) => {
-                self.load(Shelf::Plans, id, call).await.map(Found::Controller)
-            }
+            Controller::Plan(id) => self.load(Shelf::Plans, id, call).await.map(Found::Controller),
             Controller::Problem(problem) => {
                 let id = record::problem_id(&problem);
                 match self.obtain(id, problem, call).await? {
@@ -483,6 +487,10 @@ impl Service {
         self.metrics.general_solver_calls.inc_by(count(work.general_solver_calls));
     }
 
+    fn planned(&self, outcome: &'static str) {
+        self.metrics.plans.get_or_create(&OutcomeLabels { outcome }).inc();
+    }
+
     fn looked_up(&self, outcome: &'static str) {
         self.metrics.artifacts.get_or_create(&OutcomeLabels { outcome }).inc();
     }
@@ -521,11 +529,7 @@ fn kept_plan(loaded: Loaded) -> KeptPlanAnswer {
 }
 
 /// Reads and checks what stands on a shelf under `id`.
-fn stored(
-    store: &dyn RecordStore,
-    shelf: Shelf,
-    id: ArtifactId,
-) -> Result<Option<Loaded>, Error> {
+fn stored(store: &dyn RecordStore, shelf: Shelf, id: ArtifactId) -> Result<Option<Loaded>, Error> {
     let Some(record) = store.get(shelf, &id.0)? else { return Ok(None) };
     match record::decode(shelf, id, &record) {
         Ok((artifact, bytes)) => Ok(Some(loaded(id, Arc::new(artifact), bytes))),

@@ -126,6 +126,13 @@ mod tests {
     }
 
     #[test]
+    fn record_of_a_plan_that_is_no_plan_is_refused() {
+        let record = encode(Method::DisturbanceFeedback, b"no plan");
+        let fault = decode(Shelf::Plans, content_id(b"no plan"), &record).map(|_| ());
+        assert!(fault.unwrap_err().contains("checksum"));
+    }
+
+    #[test]
     fn artifact_id_depends_on_every_part() {
         let one = artifact_id(Method::VariableHorizon, b"problem");
         assert_eq!(one, artifact_id(Method::VariableHorizon, b"problem"));

@@ -249,7 +249,10 @@ mod tests {
         let (folder, store, _) = store_with_a_record();
         drop(store);
         let store = DirectoryStore::open(folder.path()).unwrap();
-        assert_eq!(store.get(SHELF, &ID).unwrap().as_deref(), Some(&b"what was thought long ago"[..]));
+        assert_eq!(
+            store.get(SHELF, &ID).unwrap().as_deref(),
+            Some(&b"what was thought long ago"[..])
+        );
         assert_eq!(store.list(SHELF, None, 9).unwrap(), [ID]);
     }
 

@@ -81,9 +81,8 @@ mod tests {
     #[test]
     fn memory_store_full_refuses_and_keeps_what_it_has() {
         let store = MemoryStore::new(10);
-        let put = |n: u8, size| {
-            store.put_if_absent(Shelf::Artifacts, &[n; 32], vec![n; size].into())
-        };
+        let put =
+            |n: u8, size| store.put_if_absent(Shelf::Artifacts, &[n; 32], vec![n; size].into());
         assert_eq!(put(1, 8).unwrap(), Put::Created);
         assert!(matches!(put(2, 3), Err(StoreError::Full(_))));
         assert_eq!(put(3, 2).unwrap(), Put::Created);

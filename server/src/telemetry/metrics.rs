@@ -70,6 +70,8 @@ pub(crate) struct Metrics {
     pub(crate) artifacts: Family<OutcomeLabels, Counter>,
     /// Same problem, different artifact: determinism broke.
     pub(crate) artifact_conflicts: Counter,
+    /// Plans: `computed`, `infeasible`, `uploaded`, `refused`, `exported`.
+    pub(crate) plans: Family<OutcomeLabels, Counter>,
     /// Open connections.
     pub(crate) connections: Gauge,
     /// Connections dropped because too many were open.
@@ -101,6 +103,7 @@ impl Metrics {
             certificate_failures: Counter::default(),
             artifacts: Family::default(),
             artifact_conflicts: Counter::default(),
+            plans: Family::default(),
             connections: Gauge::default(),
             connections_refused: Counter::default(),
         };
@@ -138,6 +141,7 @@ impl Metrics {
         r.register("artifact_lookups", "Where artifacts came from", self.artifacts.clone());
         let help = "Same problem, different artifact: determinism broke";
         r.register("artifact_conflicts", help, self.artifact_conflicts.clone());
+        r.register("plans", "Plans by what became of them", self.plans.clone());
         r.register("connections", "Open connections", self.connections.clone());
         let help = "Connections dropped because too many were open";
         r.register("connections_refused", help, self.connections_refused.clone());

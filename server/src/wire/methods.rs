@@ -128,7 +128,9 @@ impl Problem {
             Self::VariableHorizon(problem) => {
                 types::render_infeasible(why, types::Units::scaled(wire::position_unit_m(problem)))
             }
-            Self::DisturbanceFeedback(_) => types::render_infeasible(why, types::Units::IMPULSES),
+            Self::DisturbanceFeedback(problem) => {
+                types::render_infeasible(why, types::Units::impulses(problem.delta_v_max_m_s))
+            }
         }
     }
 }
@@ -424,6 +426,14 @@ impl PlanVerdict {
         self.plan().map(|plan| &plan.certificate)
     }
 
+    /// Whether there is no plan.
+    pub(crate) fn is_infeasible(&self) -> bool {
+        match self {
+            Self::VariableHorizon(_) => self.plan().is_none(),
+            Self::DisturbanceFeedback => false,
+        }
+    }
+
     /// What the solvers did; unknown without a plan.
     pub(crate) fn work(&self) -> SolverWork {
         self.plan().map(|plan| work(&plan.diagnostics)).unwrap_or_default()
@@ -458,10 +468,13 @@ impl Candidate {
     pub(crate) fn verify(self) -> Result<Artifact, Violations> {
         let plan = match self {
             Self::Document(claimed) => claimed.verify()?,
-            Self::Binary(bytes) => export::binary::read(&bytes).map_err(|fault| {
-                let fault = Fault::new("binary", "a plan as ExportPlan writes it", fault.to_string());
-                Violations::under("", vec![fault])
-            })?,
+            Self::Binary(bytes) => {
+                disturbance_feedback::Plan::from_bytes(&bytes).map_err(|fault| {
+                    let expected = "a plan as PLAN_FORMAT_BINARY writes it";
+                    let fault = Fault::new("binary", expected, fault.to_string());
+                    Violations::under("", vec![fault])
+                })?
+            }
         };
         Ok(Artifact::DisturbanceFeedback(Box::new(plan)))
     }

@@ -23,7 +23,7 @@ pub(crate) use calls::{
 };
 pub(crate) use controller_state::{ControllerState, StateFault};
 pub(crate) use disturbance_feedback::Claimed;
-pub(crate) use export::{Document, Missing, Order, read_ocm_burns};
+pub(crate) use export::{Document, Missing, OcmBurn, OcmFault, Order, read_ocm_burns};
 pub(crate) use methods::{
     Artifact, Candidate, PlanVerdict, Problem, SolverWork, State, Step, VerdictKind,
 };

@@ -374,18 +374,19 @@ fn render_family(family: ConstraintFamily) -> i32 {
 pub(super) struct Units {
     /// Metres in one unit of a state constraint, for spacecraft plants.
     position_unit_m: Option<f64>,
-    /// Metres per second in one unit of an input constraint, where inputs are impulses.
-    impulse_unit_m_s: Option<f64>,
+    /// The limit of an impulse that input constraints are measured in, m/s.
+    impulse_limit_m_s: Option<f64>,
 }
 
 impl Units {
-    /// Amounts of impulses are in m/s.
-    pub(super) const IMPULSES: Self =
-        Self { position_unit_m: None, impulse_unit_m_s: Some(1.0) };
+    /// Inputs are impulses, and amounts are shares of their limit.
+    pub(super) fn impulses(limit_m_s: f64) -> Self {
+        Self { position_unit_m: None, impulse_limit_m_s: Some(limit_m_s) }
+    }
 
     /// Scaled amounts; `position_unit_m` is metres in one unit of position.
     pub(super) fn scaled(position_unit_m: Option<f64>) -> Self {
-        Self { position_unit_m, impulse_unit_m_s: None }
+        Self { position_unit_m, impulse_limit_m_s: None }
     }
 }
 
@@ -435,25 +436,23 @@ pub(super) fn render_certificate(
 }
 
 /// Writes why there is no answer.
-pub(super) fn render_infeasible(
-    infeasibility: &Infeasibility,
-    units: Units,
-) -> v1::Infeasible {
+pub(super) fn render_infeasible(infeasibility: &Infeasibility, units: Units) -> v1::Infeasible {
     let row = |r: &control::ProofRow| v1::ConstraintRow {
         family: render_family(r.family),
         stage: count(r.stage),
         row: count(r.row),
         weight: r.weight,
     };
-    let relaxation = |r: &control::Relaxation| v1::Relaxation {
-        family: render_family(r.family),
-        horizon: count(r.horizon),
-        amount_nd: r.amount,
-        amount_m: in_metres(r.family, r.amount, units.position_unit_m),
-        amount_m_s: match r.family {
-            ConstraintFamily::Input => units.impulse_unit_m_s.map(|unit| r.amount * unit),
-            _ => None,
-        },
+    let relaxation = |r: &control::Relaxation| {
+        let limit = units.impulse_limit_m_s.filter(|_| r.family == ConstraintFamily::Input);
+        v1::Relaxation {
+            family: render_family(r.family),
+            horizon: count(r.horizon),
+            amount_nd: r.amount,
+            amount_m: in_metres(r.family, r.amount, units.position_unit_m),
+            amount_m_s: limit.map(|limit| r.amount * limit),
+            limit_m_s: limit.map(|limit| (1.0 + r.amount) * limit),
+        }
     };
     v1::Infeasible {
         reason: infeasibility.reason.clone(),

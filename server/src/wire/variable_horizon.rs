@@ -15,9 +15,9 @@ use vbar_proto::v1::{self, variable_horizon_problem::Plant as PlantMessage};
 use super::{
     Door, Parse, Path, count,
     types::{
-        Axes, ElapsedAndState, MeasuredState, Size, Units, integer, list, matrix, not_negative, number,
-        polytope, positive, render_certificate, render_infeasible, render_matrix, render_vectors,
-        unknown_enum, vector, vector3,
+        Axes, ElapsedAndState, MeasuredState, Size, Units, integer, list, matrix, not_negative,
+        number, polytope, positive, render_certificate, render_infeasible, render_matrix,
+        render_vectors, unknown_enum, vector, vector3,
     },
 };
 
@@ -799,7 +799,9 @@ pub(super) fn render_step(
             deviation_norm_nd: arrival.deviation_norm,
             inside_guaranteed_set: arrival.inside_guaranteed_set,
         }),
-        Verdict::Infeasible(why) => Message::Infeasible(render_infeasible(why, Units::scaled(unit))),
+        Verdict::Infeasible(why) => {
+            Message::Infeasible(render_infeasible(why, Units::scaled(unit)))
+        }
     };
     let trajectory = step.trajectory.as_ref().filter(|_| !omit_prediction);
     v1::StepResponse {

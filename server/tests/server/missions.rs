@@ -72,6 +72,66 @@ pub(crate) fn double_integrator() -> Value {
     } })
 }
 
+/// Prisma in 5 hours with 6 instants, as in `tests/golden/disturbance_feedback`, made a mission in
+/// space and time: orientation and epoch are made up.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn prisma() -> Value {
+    json!({ "disturbanceFeedback": {
+        "orbit": {
+            "elements": {
+                "semiMajorAxisM": 7_011_000.0,
+                "eccentricity": 0.004,
+                "trueAnomalyDeg": 0.0,
+                "inclinationDeg": 98.2,
+                "raanDeg": 30.0,
+                "argumentOfPerigeeDeg": 77.0,
+                "frame": "INERTIAL_FRAME_EME2000",
+            },
+            "epoch": { "calendar": "2027-03-01T12:00:00", "timeSystem": "TIME_SYSTEM_UTC" },
+        },
+        "initial": { "relative": {
+            "frame": "FRAME_LVLH_CCSDS",
+            "positionM": [10_000.0, 0.0, 0.0],
+            "velocityMS": [0.0, 0.0, 0.0],
+        } },
+        "targetState": {
+            "frame": "FRAME_LVLH_CCSDS",
+            "positionM": [330.0, 0.0, 30.0],
+            "velocityMS": [0.0, 0.0, -0.0158],
+        },
+        "instants": { "equalTime": { "count": 6, "durationS": 18_000.0 } },
+        "deltaVMaxMS": 0.26,
+        "navigationErrors": [
+            { "radii": { "positionRadiusM": 0.02, "velocityRadiusMS": 0.002 } },
+        ],
+        "metric": "ARRIVAL_METRIC_SCALED_6",
+        "fuelWeight": 1.0,
+    } })
+}
+
+/// The same in 6000 s with 10 instants and another limit.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn prisma_6000_s(delta_v_max_m_s: f64) -> Value {
+    let mut problem = prisma();
+    let method = &mut problem["disturbanceFeedback"];
+    method["instants"] = json!({ "equalTime": { "count": 10, "durationS": 6_000.0 } });
+    method["deltaVMaxMS"] = delta_v_max_m_s.into();
+    problem
+}
+
+/// The planned state of the first instant, as if measured at instant `k` of Prisma.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn prisma_measurement(k: u32) -> Value {
+    json!({
+        "relative": {
+            "frame": "FRAME_LVLH_CCSDS",
+            "positionM": [10_000.0, 0.0, 0.0],
+            "velocityMS": [0.0, 0.0, 0.0],
+        },
+        "elapsedS": 3_600.0 * f64::from(k),
+    })
+}
+
 /// The message that `json` writes.
 pub(crate) fn message<M: prost::Message + prost::Name + Default>(json: Value) -> M {
     let message = DynamicMessage::deserialize(descriptor::<M>(), json);

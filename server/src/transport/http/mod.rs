@@ -105,11 +105,7 @@ async fn list_plans(State(http): Shared, request: Request) -> Response {
 /// `GET /v1/plans/{id}` and `GET /v1/plans/{id}:export`.
 ///
 /// The router takes whole segments only, so the verb is told apart here.
-async fn kept_plan(
-    State(http): Shared,
-    Path(segment): Path<String>,
-    request: Request,
-) -> Response {
+async fn kept_plan(State(http): Shared, Path(segment): Path<String>, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, _)| match segment.strip_suffix(":export") {
         None => {
             no_query(&parts)?;
@@ -440,15 +436,16 @@ fn export_request(id: &str, parts: &Parts) -> Result<v1::ExportPlanRequest, Http
 
 fn plan_format(value: &str) -> Result<v1::PlanFormat, HttpError> {
     let full = format!("PLAN_FORMAT_{value}");
-    v1::PlanFormat::from_str_name(value).or_else(|| v1::PlanFormat::from_str_name(&full)).ok_or_else(
-        || Error::field("format", "CCSDS_OCM, CCSDS_OEM, CSV or BINARY", value).into(),
-    )
+    v1::PlanFormat::from_str_name(value)
+        .or_else(|| v1::PlanFormat::from_str_name(&full))
+        .ok_or_else(|| Error::field("format", "CCSDS_OCM, CCSDS_OEM, CSV or BINARY", value).into())
 }
 
 /// The document itself, under its own media type.
 fn document(made: Timed<Document>) -> Response {
     let Timed { value, compute } = made;
-    let mut response = ([(header::CONTENT_TYPE, value.content_type)], value.content).into_response();
+    let mut response =
+        ([(header::CONTENT_TYPE, value.content_type)], value.content).into_response();
     let headers = response.headers_mut();
     let name = format!("attachment; filename=\"{}\"", value.file_name);
     if let Ok(name) = HeaderValue::from_str(&name) {

@@ -70,6 +70,7 @@ impl Claimed {
         let plan = Plan::from_burns_and_gains(problem, burns, gains, origin)
             .map_err(|faults| violations(&root, faults))?;
         let mut faults = plan.disagreements(&outcome);
+        faults.extend(shares_that_differ(plan.outcome(), &outcome));
         let start = plan.problem().epoch.as_ref();
         for (i, (claimed, burn)) in epochs.iter().zip(&plan.outcome().burns).enumerate() {
             let expected = burn_epoch(burn, start);
@@ -80,6 +81,40 @@ impl Claimed {
         }
         if faults.is_empty() { Ok(plan) } else { Err(violations(&root, faults)) }
     }
+}
+
+/// What [`Plan::disagreements`] leaves to us: numbers that only split up others.
+fn shares_that_differ(own: &Outcome, claimed: &Outcome) -> Vec<Fault> {
+    // As there: a document may have passed through decimals.
+    const SAME: f64 = 1e-9;
+    let mut faults = Vec::new();
+    let mut compare = |field: &str, own: f64, claimed: f64, size: f64| {
+        if !((own - claimed).abs() <= SAME * size) {
+            faults.push(Fault::new(field, format!("{own:?}"), format!("{claimed:?}")));
+        }
+    };
+    compare("effort_m_s", own.effort_m_s, claimed.effort_m_s, 1.0 + own.effort_m_s.abs());
+    let size = own.trace.abs().sqrt();
+    if own.trace_shares.len() != claimed.trace_shares.len() {
+        let (own, claimed) = (own.trace_shares.len(), claimed.trace_shares.len());
+        return vec![Fault::new("trace_shares", own.to_string(), claimed.to_string())];
+    }
+    for (i, (own, claimed)) in own.trace_shares.iter().zip(&claimed.trace_shares).enumerate() {
+        compare(&format!("trace_shares[{i}]"), *own, *claimed, size);
+    }
+    let mut sets = vec![("arrival", &own.arrival, &claimed.arrival)];
+    if let (Some(own), Some(claimed)) = (&own.open_loop_arrival, &claimed.open_loop_arrival) {
+        sets.push(("open_loop_arrival", own, claimed));
+    }
+    for (name, own, claimed) in sets {
+        let (own, claimed) = (&own.position_shape, &claimed.position_shape);
+        for (i, j) in (0..3).flat_map(|i| (0..3).map(move |j| (i, j))) {
+            let size = (own[(i, i)] * own[(j, j)]).sqrt();
+            let field = format!("{name}.position_shape[{i}][{j}]");
+            compare(&field, own[(i, j)], claimed[(i, j)], size);
+        }
+    }
+    faults
 }
 
 /// Fields of the problem keep their prefix; every other one is the plan's.
@@ -256,8 +291,7 @@ fn diagnostics(
     const ITERATIONS_MAX: usize = 1_000_000;
     let message = door.required(&message.diagnostics, path)?;
     let iterations = message.conic_iterations;
-    let iterations =
-        integer(iterations, 0..=ITERATIONS_MAX, path.field("conic_iterations"), door);
+    let iterations = integer(iterations, 0..=ITERATIONS_MAX, path.field("conic_iterations"), door);
     let least = finite(message.delta_v_max_least_m_s, path.field("delta_v_max_least_m_s"), door);
     let origin = Origin { fast_path: message.fast_path, conic_iterations: iterations? };
     Some((origin, least?))

@@ -275,8 +275,7 @@ fn outer_sum(value: i32, path: Path<'_>, door: &mut Door) -> Option<OuterSum> {
 
 fn metric(value: i32, path: Path<'_>, door: &mut Door) -> Option<ArrivalMetric> {
     use v1::ArrivalMetric as Message;
-    const EXPECTED: &str =
-        "ARRIVAL_METRIC_POSITION, _SCALED_6, _PHYSICAL_6 or unspecified";
+    const EXPECTED: &str = "ARRIVAL_METRIC_POSITION, _SCALED_6, _PHYSICAL_6 or unspecified";
     match Message::try_from(value) {
         Ok(Message::Unspecified | Message::Position) => Some(ArrivalMetric::Position),
         Ok(Message::Scaled6) => Some(ArrivalMetric::Scaled6),

@@ -34,8 +34,7 @@ pub(super) fn write(plan: &Plan) -> String {
         }
         match outcome.burns.get(k) {
             Some(burn) => {
-                let parts =
-                    [burn.delta_v_m_s, burn.correction_max_m_s, burn.saturation_margin_m_s];
+                let parts = [burn.delta_v_m_s, burn.correction_max_m_s, burn.saturation_margin_m_s];
                 parts.iter().flatten().for_each(|&value| append(&mut line, value));
             }
             None => line.extend(std::iter::repeat_n(',', BURN_COLUMNS)),

@@ -2,7 +2,6 @@
 //!
 //! A document that needs what the mission does not have is not written; what is missing is named.
 
-pub(crate) mod binary;
 mod csv;
 mod ocm;
 mod oem;
@@ -17,7 +16,7 @@ use super::{
     types::unknown_enum,
 };
 
-pub(crate) use ocm::{OcmFault, read_burns as read_ocm_burns};
+pub(crate) use ocm::{OcmBurn, OcmFault, read_burns as read_ocm_burns};
 
 /// What is asked for.
 #[derive(Debug, Clone)]
@@ -66,7 +65,8 @@ pub(crate) fn export(plan: &Plan, plan_id: &str, order: &Order) -> Result<Docume
         Format::Ocm => (ocm::write(plan, plan_id, &order.labels)?.into(), TEXT, "ocm"),
         Format::Oem => (oem::write(plan, plan_id, &order.labels)?.into(), TEXT, "oem"),
         Format::Csv => (csv::write(plan).into(), "text/csv; charset=utf-8", "csv"),
-        Format::Binary => (binary::write(plan), "application/octet-stream", "vbup"),
+        // `proto/UPLINK.md` has it byte by byte; its sha256 is the plan's id.
+        Format::Binary => (plan.to_bytes().into(), "application/octet-stream", "bin"),
     };
     let short: String = plan_id.chars().take(12).collect();
     Ok(Document { content, content_type, file_name: format!("plan-{short}.{extension}") })

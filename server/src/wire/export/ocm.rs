@@ -41,7 +41,8 @@ pub(super) fn write(plan: &Plan, plan_id: &str, labels: &Labels) -> Result<Strin
             "COMMENT MAN_REF_FRAME is that of the orbit of the target, {}: x along-track,",
             labels.target_name
         ),
-        "COMMENT y minus orbit normal, z nadir. It is not that of this object's own orbit.".to_owned(),
+        "COMMENT y minus orbit normal, z nadir. It is not that of this object's own orbit."
+            .to_owned(),
         "COMMENT An impulse has duration 0.".to_owned(),
         "MAN_ID = RENDEZVOUS".to_owned(),
         "MAN_BASIS = PLANNED".to_owned(),
@@ -209,7 +210,10 @@ mod tests {
         let frame = "MAN_REF_FRAME = LVLH_ROTATING\n";
         assert_eq!(places(&OCM.replace(frame, "")), ["MAN_REF_FRAME"]);
         assert_eq!(places(&OCM.replace(frame, "MAN_REF_FRAME = LVLH\n")), ["MAN_REF_FRAME"]);
-        assert_eq!(places(&OCM.replace(frame, "MAN_REF_FRAME = RSW_ROTATING\n")), ["MAN_REF_FRAME"]);
+        assert_eq!(
+            places(&OCM.replace(frame, "MAN_REF_FRAME = RSW_ROTATING\n")),
+            ["MAN_REF_FRAME"]
+        );
     }
 
     #[test]

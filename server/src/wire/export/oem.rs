@@ -23,8 +23,9 @@ use crate::wire::orbits::{ccsds_frame, ccsds_time_system};
 const STEP_ANGLE_RAD: f64 = 0.1;
 /// Fewest intervals of an arc: interpolation of degree 7 needs eight states.
 const INTERVALS_MIN: usize = 7;
-/// Most intervals of an arc: thirty revolutions. A longer arc gets longer steps.
-const INTERVALS_MAX: usize = 2_000;
+/// Most states of a document, about sixty revolutions: it stays below the 4 MB that clients take.
+/// A longer mission gets longer steps.
+const STATES_MAX: usize = 4_000;
 /// Covariance of what is uniform in an ellipsoid of dimension 6 over its shape matrix.
 const COVARIANCE_OVER_SHAPE: f64 = 1.0 / 8.0;
 
@@ -57,8 +58,10 @@ pub(super) fn write(plan: &Plan, plan_id: &str, labels: &Labels) -> Result<Strin
         format!("ORIGINATOR = {}", labels.originator),
     ];
     let frame = ccsds_frame(orientation.axes);
-    for arc in plan.outcome().states.windows(2) {
-        let points = arc_points(&problem.orbit, &arc[0], &arc[1]);
+    let arcs = plan.outcome().states.windows(2);
+    let most = STATES_MAX / arcs.len().max(1);
+    for arc in arcs {
+        let points = arc_points(&problem.orbit, &arc[0], &arc[1], most);
         segment(&mut lines, &points, epoch, frame, labels);
     }
     Ok(lines.join("\n") + "\n")
@@ -110,10 +113,15 @@ fn segment(lines: &mut Vec<String>, points: &[Point], epoch: &Epoch, frame: &str
 }
 
 /// States from just after the burn at `from` to just before the one at `to`.
-fn arc_points(orbit: &KeplerOrbit, from: &PlannedState, to: &PlannedState) -> Vec<Point> {
+fn arc_points(
+    orbit: &KeplerOrbit,
+    from: &PlannedState,
+    to: &PlannedState,
+    most: usize,
+) -> Vec<Point> {
     let (start, stop) = (from.elapsed.seconds(), to.elapsed.seconds());
-    let intervals = intervals(orbit, stop - start);
-    #[allow(clippy::cast_precision_loss, reason = "at most INTERVALS_MAX")]
+    let intervals = intervals(orbit, stop - start).min(most - 1);
+    #[allow(clippy::cast_precision_loss, reason = "at most STATES_MAX")]
     let share = |i: usize| i as f64 / intervals as f64;
     (0..=intervals)
         .filter_map(|i| {
@@ -135,10 +143,10 @@ fn intervals(orbit: &KeplerOrbit, duration_s: f64) -> usize {
     #[allow(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
-        reason = "a saturating cast of a positive number, clamped"
+        reason = "a saturating cast of a positive number"
     )]
     let wanted = wanted as usize;
-    wanted.clamp(INTERVALS_MIN, INTERVALS_MAX)
+    wanted.max(INTERVALS_MIN)
 }
 
 /// The chaser at `elapsed`, from what is planned at the end of its arc; `None` only for an orbit

@@ -99,16 +99,13 @@ pub(in crate::wire) fn calendar_after(epoch: &Epoch, elapsed: Seconds) -> String
         moment.to_gregorian(scale(epoch.time_system));
     let fraction = format!("{nanosecond:09}");
     let kept = fraction.trim_end_matches('0').len().max(3);
-    format!(
-        "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{}",
-        &fraction[..kept]
-    )
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{}", &fraction[..kept])
 }
 
 /// Seconds of atomic time from one epoch to another.
 pub(super) fn seconds_between(from: &Epoch, to: &Epoch) -> f64 {
-    let nanoseconds = i128::from(to.nanoseconds_since_j2000_tai)
-        - i128::from(from.nanoseconds_since_j2000_tai);
+    let nanoseconds =
+        i128::from(to.nanoseconds_since_j2000_tai) - i128::from(from.nanoseconds_since_j2000_tai);
     Duration::from_total_nanoseconds(nanoseconds).to_seconds()
 }
 
@@ -211,7 +208,7 @@ mod tests {
     fn epoch_scales_differ_by_what_they_should() {
         let text = "2027-03-01T12:00:00.000";
         let tai = moment(text, TimeSystem::Tai);
-        let later = |system, seconds| {
+        let later = |system, seconds: f64| {
             let difference = seconds_between(&tai, &moment(text, system));
             assert!((difference - seconds).abs() < 1e-9, "{system:?} {difference}");
         };

@@ -3,11 +3,11 @@
 //! The constants are those the elements were made with (WGS-72), so a state agrees with what other
 //! tools make of the same elements.
 
+use nalgebra::Vector3;
 use sgp4::{
     Constants, Elements, MinutesSinceEpoch, Orbit,
     chrono::{Datelike as _, Timelike as _},
 };
-use nalgebra::Vector3;
 use vbar_guidance::{
     epoch::{Epoch, TimeSystem},
     frames::{InFrame, InertialAxes},
@@ -54,7 +54,8 @@ fn check_line(number: &str, line: &str) -> Result<(), ElementFault> {
         return Err(fault(format!("line {number} to begin with {number}"), format!("{line:?}")));
     }
     let (sum, given) = line.split_at(LINE_LENGTH - 1);
-    let sum: u32 = sum.chars().map(|c| if c == '-' { 1 } else { c.to_digit(10).unwrap_or(0) }).sum();
+    let sum: u32 =
+        sum.chars().map(|c| if c == '-' { 1 } else { c.to_digit(10).unwrap_or(0) }).sum();
     let expected = (sum % 10).to_string();
     if given != expected {
         return Err(fault(format!("checksum {expected} at the end of line {number}"), given));
@@ -74,15 +75,21 @@ fn finite(elements: Elements) -> Result<Elements, ElementFault> {
         ("the drag term", elements.drag_term),
     ];
     match numbers.iter().find(|(_, value)| !value.is_finite()) {
-        Some((name, value)) => Err(fault(format!("{name} to be a finite number"), value.to_string())),
+        Some((name, value)) => {
+            Err(fault(format!("{name} to be a finite number"), value.to_string()))
+        }
         None => Ok(elements),
     }
 }
 
 /// The state at `epoch`, in TEME.
-pub(super) fn propagated(elements: &Elements, epoch: &Epoch) -> Result<InertialState, ElementFault> {
-    let own = own_epoch(elements)
-        .ok_or_else(|| fault("elements of the years 1972 to 2200", elements.datetime.to_string()))?;
+pub(super) fn propagated(
+    elements: &Elements,
+    epoch: &Epoch,
+) -> Result<InertialState, ElementFault> {
+    let own = own_epoch(elements).ok_or_else(|| {
+        fault("elements of the years 1972 to 2200", elements.datetime.to_string())
+    })?;
     let minutes = seconds_between(&own, epoch) / 60.0;
     let constants = constants(elements).map_err(|found| fault(PROPAGATED, found.to_string()))?;
     let state = constants
@@ -156,7 +163,11 @@ mod tests {
     fn tle_propagates_as_the_reference_programme_does() {
         let elements = read_tle(VANGUARD).unwrap();
         for (minutes, position_km, velocity_km_s) in [
-            (0.0, [7022.46529266, -1400.08296755, 0.03995155], [1.893841015, 6.405893759, 4.534807250]),
+            (
+                0.0,
+                [7022.46529266, -1400.08296755, 0.03995155],
+                [1.893841015, 6.405893759, 4.534807250],
+            ),
             (
                 360.0,
                 [-7154.03120202, -3783.17682504, -3536.19412294],

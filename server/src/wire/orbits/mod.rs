@@ -138,7 +138,9 @@ fn orientation(
         let place = path.field(name);
         match degrees {
             Some(degrees) => angle(degrees, place, door),
-            None => door.refuse(place, "a value: orientation is given whole or not at all", "nothing"),
+            None => {
+                door.refuse(place, "a value: orientation is given whole or not at all", "nothing")
+            }
         }
     });
     let (inclination, raan, perigee) = (angles.next()?, angles.next()?, angles.next()?);
@@ -289,7 +291,8 @@ pub(super) fn initial_state(
             };
             let relative = relative_state(&target, &chaser);
             relative.or_else(|| {
-                let expected = format!("the axes of the target's orbit ({})", ccsds_frame(target.axes));
+                let expected =
+                    format!("the axes of the target's orbit ({})", ccsds_frame(target.axes));
                 door.refuse(path.field("frame"), expected, ccsds_frame(chaser.axes))
             })
         }

@@ -80,7 +80,8 @@ impl<'a> Omm<'a> {
         let frame = self.one_of("REF_FRAME", &["TEME"]);
         let system = self.one_of("TIME_SYSTEM", &["UTC"]);
         let theory = self.one_of("MEAN_ELEMENT_THEORY", &["SGP4", "SGP/SGP4"]);
-        let ephemeris = self.given("EPHEMERIS_TYPE").then(|| self.one_of("EPHEMERIS_TYPE", &["0", "2"]));
+        let ephemeris =
+            self.given("EPHEMERIS_TYPE").then(|| self.one_of("EPHEMERIS_TYPE", &["0", "2"]));
         let datetime = self.epoch();
         let mean_motion = self.number("MEAN_MOTION", |n| n > 0.0, "a number above 0 (rev/day)");
         let eccentricity =
@@ -93,11 +94,13 @@ impl<'a> Omm<'a> {
         let drag_term = self.number("BSTAR", f64::is_finite, "a number (1/Earth radii)");
         let object_name = self.text("OBJECT_NAME");
         // SGP4 does not use these two; where they stand they must be numbers.
-        let mut rate = |name| if self.given(name) { self.number(name, f64::is_finite, "a number") } else { Some(0.0) };
+        let mut rate = |name| {
+            if self.given(name) { self.number(name, f64::is_finite, "a number") } else { Some(0.0) }
+        };
         let mean_motion_dot = rate("MEAN_MOTION_DOT");
         let mean_motion_ddot = rate("MEAN_MOTION_DDOT");
         self.refuse_unknown();
-        (version?, centre?, frame?, system?, theory?);
+        version.and(centre).and(frame).and(system).and(theory)?;
         ephemeris.unwrap_or(Some(()))?;
         Some(Elements {
             object_name,

@@ -33,12 +33,13 @@ const FOR_TESTS: [(&str, &[&str]); 2] =
     [("vbar-server", &["vbar-client"]), ("vbar-simulator", &["vbar-server"])];
 
 /// Modules of the server, which of each other they may use, and which crates of ours.
-const SERVER: [(&str, &[&str], &[&str]); 8] = [
+const SERVER: [(&str, &[&str], &[&str]); 9] = [
     ("telemetry", &[], &[]),
     ("store", &[], &[]),
     ("compute", &["telemetry"], &["vbar_guidance"]),
     ("wire", &[], &["vbar_proto", "vbar_guidance"]),
     ("config", &["wire"], &[]),
+    ("offline", &["wire"], &["vbar_proto"]),
     ("service", &["config", "telemetry", "store", "compute", "wire"], &["vbar_guidance"]),
     ("transport", &["config", "telemetry", "service", "wire"], &["vbar_proto"]),
     ("node", &["config", "telemetry", "store", "compute", "wire", "service", "transport"], &[]),
