@@ -38,17 +38,17 @@ impl Ellipsoid {
         }
     }
 
-    /// `e' shape^-1 e` of a position error in the position set: at most 1 inside.
+    /// Least t with a position error in t times the position set: at most 1 inside.
     pub(crate) fn position_level(&self, error: &Vector6<f64>) -> f64 {
         let position: Vector3<f64> = error.fixed_rows::<3>(0).into();
         let unit = self.position_root.solve_lower_triangular(&position);
-        unit.map_or(f64::INFINITY, |unit| unit.norm_squared())
+        unit.map_or(f64::INFINITY, |unit| unit.norm())
     }
 
     /// The same of position and velocity together.
     pub(crate) fn state_level(&self, error: &Vector6<f64>) -> f64 {
         let unit = self.root.solve_lower_triangular(error);
-        unit.map_or(f64::INFINITY, |unit| unit.norm_squared())
+        unit.map_or(f64::INFINITY, |unit| unit.norm())
     }
 
     /// Semi-axes of the position set's projection on the orbital plane, longer first.
@@ -119,11 +119,11 @@ mod tests {
             Vector6::new(0.0, 2.0, 0.0, 0.0, 0.0, 0.0),
         ] {
             assert!((set.position_level(&tip) - 1.0).abs() < 1e-12);
-            assert!((set.state_level(&(tip * 0.5)) - 0.25).abs() < 1e-12);
+            assert!((set.state_level(&(tip * 0.5)) - 0.5).abs() < 1e-12);
         }
         // Velocity counts for the state alone.
         let fast = Vector6::new(0.0, 0.0, 0.0, 0.02, 0.0, 0.0);
-        assert!((set.state_level(&fast) - 4.0).abs() < 1e-12);
+        assert!((set.state_level(&fast) - 2.0).abs() < 1e-12);
         assert_eq!(set.position_level(&fast), 0.0);
     }
 

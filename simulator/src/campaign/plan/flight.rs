@@ -50,7 +50,7 @@ pub struct PlanFlight {
     pub disturbance_gauges: Vec<f64>,
     /// The service saw a disturbance outside the assumed set.
     pub outside_assumed_set: bool,
-    /// Level `e' Q^-1 e` of the measured position's error in the guaranteed arrival set
+    /// Level of the measured position's error in the guaranteed arrival set, `sqrt(e' Q^-1 e)`
     /// [Deaconu2014, eq. 21]: at most 1 inside.
     pub position_level: f64,
     /// The same with position and velocity.

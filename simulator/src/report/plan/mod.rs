@@ -45,8 +45,8 @@ impl PlanReport {
     /// Of each plan, beside what [`plan_rows_json`] says of it:
     ///
     /// - `runs`, and `inside_arrival_set`: runs whose measured position arrived inside the set;
-    /// - `position_level`, `state_level`: `e' Q^-1 e` of the measured error in the guaranteed set,
-    ///   of position alone and of the whole state; at most 1 inside;
+    /// - `position_level`, `state_level`: `sqrt(e' Q^-1 e)` of the measured error in the
+    ///   guaranteed set, of position alone and of the whole state; at most 1 inside;
     /// - `true_position_level`, `final_distance_m`: of the true position;
     /// - `fuel_flown_m_s`: sum of |delta-v| over burns and axes;
     /// - `burns`, `clipped_burns`, `clipped_runs`;

@@ -162,8 +162,13 @@ fn axes(row: &PlanRow, planned: &Planned) -> String {
         axes.map_or_else(String::new, |[longer, shorter]| format!("{longer}  {shorter}"))
     };
     let published = &row.mission.published;
-    let titles = ["arrival set, semi-axes [m]", "in plane", "in space", "published, in plane"];
-    let mut lines = vec![titles.map(str::to_owned).to_vec()];
+    // The paper's figures are in its own metric, whatever this plan's.
+    let paper = row.mission.table_metric().filter(|_| published.feedback_axes_m.is_some());
+    let paper = paper.map_or_else(String::new, |metric| {
+        format!("published, in plane ({})", metric_name(metric))
+    });
+    let titles = ["arrival set, semi-axes [m]", "in plane", "in space"].map(str::to_owned);
+    let mut lines = vec![titles.into_iter().chain([paper]).collect::<Vec<_>>()];
     if let Some(set) = &planned.plan.arrival {
         lines.push(vec![
             "with feedback".into(),
