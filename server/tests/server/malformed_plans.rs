@@ -180,7 +180,8 @@ async fn malformed_plan_instants_are_named() {
     assert_eq!(info["limits"]["planInstantsMax"], 5);
 }
 
-/// Half a revolution apart an impulse cannot move the orbital plane: no gain helps across it.
+/// Impulses half a revolution and a whole one before arrival turn the orbital plane about the line
+/// of arrival: no size of them moves the chaser out of the plane there.
 #[tokio::test(flavor = "multi_thread")]
 async fn malformed_plan_singular_instants_are_named() {
     let server = server().await;
@@ -188,6 +189,7 @@ async fn malformed_plan_singular_instants_are_named() {
     let mut problem = prisma();
     let method = &mut problem["disturbanceFeedback"];
     method["orbit"]["elements"]["eccentricity"] = json!(0.0);
+    method["targetState"]["positionM"] = json!([330.0, 10.0, 30.0]);
     method["instants"] = json!({ "given": { "elapsedS": [0.0, half_period, 2.0 * half_period] } });
     let request = json!({ "problem": problem });
     let answer = server.post("/v1/plans:compute", &request).await;

@@ -254,23 +254,39 @@ fn planned_states(
 }
 
 fn advanced_effects(model: &LinearModel, k: usize, effects: &Effects, gains: &[Gain]) -> Effects {
-    let mut advanced: Effects = effects
-        .iter()
-        .enumerate()
-        .map(|(i, effect)| {
-            let mut after = effect.clone();
-            let correction = product(&gain(gains, k, i).matrix, model.disturbances[i].root());
-            for row in 0..3 {
-                for column in 0..6 {
-                    after[(3 + row, column)] +=
-                        model.scales[k].velocity_scale_s * correction[(row, column)];
-                }
-            }
-            product(&model.steps[k], &after)
-        })
-        .collect();
+    let corrected = corrected_effects(model, k, effects, gains);
+    let mut advanced: Effects =
+        corrected.iter().map(|after| product(&model.steps[k], after)).collect();
     advanced.push(model.disturbances[k].root().clone());
     advanced
+}
+
+/// The effects just after burn k: each with its correction.
+fn corrected_effects(model: &LinearModel, k: usize, effects: &Effects, gains: &[Gain]) -> Effects {
+    let corrected = |(i, effect): (usize, &DMatrix<f64>)| {
+        let mut after = effect.clone();
+        let correction = product(&gain(gains, k, i).matrix, model.disturbances[i].root());
+        for row in 0..3 {
+            for column in 0..6 {
+                after[(3 + row, column)] +=
+                    model.scales[k].velocity_scale_s * correction[(row, column)];
+            }
+        }
+        after
+    };
+    effects.iter().enumerate().map(corrected).collect()
+}
+
+/// An outer ellipsoid of the true state just after burn k (6 x 6, physical): the sum of the
+/// corrected effects and of the navigation error. Until the next burn the true state only coasts,
+/// so at any time before it the image of this set is as good.
+pub(super) fn shape_after_burn(model: &LinearModel, k: usize, gains: &[Gain]) -> DMatrix<f64> {
+    let mut effects = Effects::new();
+    for earlier in 0..k {
+        effects = advanced_effects(model, earlier, &effects, gains);
+    }
+    let corrected = corrected_effects(model, k, &effects, gains);
+    physical_shape(model, k, &outer_shape(model, k, &corrected, true))
 }
 
 /// Gains are ordered by burn, then by disturbance: burn k has k of them.
