@@ -19,6 +19,9 @@ use crate::{
     report::plan::PlanReport,
 };
 
+/// Trajectories drawn, as many as in the paper's figures; the final errors are those of all runs.
+const LINES_MAX: usize = 50;
+
 /// Draws every picture that `report` has the data for, into the folder `out`; returns the files.
 ///
 /// # Errors
@@ -92,20 +95,21 @@ impl Sets {
 }
 
 fn approach(area: &Area<'_>, flights: &[PlanFlight]) -> Result<(), PictureError> {
-    let all = || flights.iter().flat_map(|flight| flight.path.iter().copied());
+    let shown = &flights[..flights.len().min(LINES_MAX)];
+    let all = || shown.iter().flat_map(|flight| flight.path.iter().copied());
     let axes = Axes {
         x: range(all().map(|point| point.0)),
         y: range(all().map(|point| point.1)),
         x_name: "along-track x [m]",
         y_name: "nadir z [m]",
-        title: "whole approach".into(),
+        title: format!("whole approach, {}", counted(shown.len())),
     };
     let mut chart = panel(area, &axes)?;
-    let opacity = (12.0_f64 / flights.len() as f64).clamp(0.15, 1.0);
-    for flight in flights {
+    let opacity = (12.0_f64 / shown.len() as f64).clamp(0.15, 1.0);
+    for flight in shown {
         line(&mut chart, flight.path.clone(), BLUE, opacity, 1)?;
     }
-    let burns = flights.first().map_or(&[][..], |flight| &flight.samples);
+    let burns = shown.first().map_or(&[][..], |flight| &flight.samples);
     dots(&mut chart, burns.iter().map(|sample| flat(&sample.truth)).collect(), INK, 3)
 }
 

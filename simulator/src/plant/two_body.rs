@@ -424,7 +424,7 @@ mod tests {
         let expected = -1.5 * n * EARTH_J2 * (EARTH_RADIUS_M / 7.140e6).powi(2) * 0.7_f64.cos();
         assert!((rate / expected - 1.0).abs() < 0.01, "{rate} {expected}");
     }
-    /// First-order secular rates of node and perigee, and of nothing else [Vallado, sec. 9.6].
+    /// First-order secular rates of node and perigee, and of nothing else.
     #[test]
     fn two_body_j2_drifts_node_and_perigee_at_their_secular_rates() {
         let elements = Elements { eccentricity: 0.3, inclination_rad: 0.5, ..envisat() };

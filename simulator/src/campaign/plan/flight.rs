@@ -1,6 +1,9 @@
 //! One flight of a plan, and the same nominal burns flown blindly.
 
-use std::time::{Duration, Instant};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use nalgebra::{Vector3, Vector6};
 use rand::{Rng, RngExt as _};
@@ -146,11 +149,15 @@ impl PlanFlight {
 /// Flies run number `run`.
 pub(crate) async fn fly(
     client: &Client,
-    flyable: &Flyable,
+    flyable: &Arc<Flyable>,
     run: u32,
 ) -> Result<PlanFlight, SimulationError> {
     let model = &flyable.model;
     let errors = draw_errors(flyable, run);
+    let open_loop = {
+        let (flyable, errors) = (flyable.clone(), errors.clone());
+        aside(move || fly_open_loop(&flyable, &errors)).await?
+    };
     let mut flight = PlanFlight {
         run,
         samples: Vec::new(),
@@ -161,7 +168,7 @@ pub(crate) async fn fly(
         state_level: f64::NAN,
         true_position_level: f64::NAN,
         final_distance_m: f64::NAN,
-        open_loop: fly_open_loop(flyable, &errors),
+        open_loop,
         path: Vec::new(),
         latencies: Vec::new(),
     };
@@ -188,7 +195,10 @@ pub(crate) async fn fly(
         };
         pair.push(&lvlh::rtn_from_lvlh(&Vector3::from(burn.delta_v_m_s)));
         flight.burns.push(burn);
-        coast(&mut pair, model.elapsed_s[k + 1] - elapsed_s, &mut flight.path);
+        let duration_s = model.elapsed_s[k + 1] - elapsed_s;
+        let (moved, way) = aside(move || coast(pair, duration_s)).await?;
+        flight.path.extend(way);
+        pair = moved;
     }
     flight.judge(flyable);
     Ok(flight)
@@ -251,17 +261,26 @@ fn seen(pair: &TwoBody) -> Vector6<f64> {
     lvlh::state_lvlh_from_rtn(&pair.relative())
 }
 
+/// Computes elsewhere, so that answers are not kept waiting by it: an hour of orbit takes
+/// milliseconds.
+async fn aside<T: Send + 'static>(
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, SimulationError> {
+    Ok(tokio::task::spawn_blocking(work).await?)
+}
+
 /// Moves both for `duration_s` without thrust and notes the way.
-fn coast(pair: &mut TwoBody, duration_s: f64, path: &mut Vec<(f64, f64)>) {
+fn coast(mut pair: TwoBody, duration_s: f64) -> (TwoBody, Vec<(f64, f64)>) {
     let place = |pair: &TwoBody| {
         let state = seen(pair);
         (state[0], state[2])
     };
-    path.push(place(pair));
+    let mut way = vec![place(&pair)];
     for _ in 0..PIECES {
         pair.advance(duration_s / f64::from(PIECES), &Vector3::zeros());
-        path.push(place(pair));
+        way.push(place(&pair));
     }
+    (pair, way)
 }
 
 /// The nominal burns alone, from the same true start.
