@@ -38,18 +38,19 @@ const PLAN_BYTES_MAX: u64 = 64 << 20;
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Missions with disturbance-feedback plans (such as prisma.json)")]
 pub(crate) struct ChangeArguments {
-    /// What shall be small about the arrival set: POSITION (metres; the default), SCALED_6 (the
-    /// paper's scaled position and velocity) or PHYSICAL_6 (metres and metres per second)
+    /// What shall be small about the arrival set, instead of the mission's own choice: POSITION (in
+    /// metres), SCALED_6 (the paper's scaled position and velocity) or PHYSICAL_6 (metres and metres
+    /// per second)
     #[arg(long, value_name = "METRIC", value_parser = metric)]
     metric: Option<ArrivalMetric>,
     /// Time from the first to the last instant, instead of the mission's own
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Largest burn along each axis, instead of the mission's own
-    #[arg(long, value_name = "M_S")]
+    #[arg(long, value_name = "M_S", allow_negative_numbers = true)]
     delta_v_max: Option<f64>,
     /// Number of equally spaced instants, with a burn at all but the last
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
     instants: Option<i32>,
 }
 
