@@ -39,8 +39,8 @@ const PLAN_BYTES_MAX: u64 = 64 << 20;
 #[command(next_help_heading = "Missions with disturbance-feedback plans (such as prisma.json)")]
 pub(crate) struct ChangeArguments {
     /// What shall be small about the arrival set, instead of the mission's own choice: POSITION (in
-    /// metres), SCALED_6 (the paper's scaled position and velocity) or PHYSICAL_6 (metres and metres
-    /// per second)
+    /// metres), SCALED_6 (the paper's scaled position and velocity) or PHYSICAL_6 (metres and
+    /// metres per second)
     #[arg(long, value_name = "METRIC", value_parser = metric)]
     metric: Option<ArrivalMetric>,
     /// Time from the first to the last instant, instead of the mission's own

@@ -103,7 +103,10 @@ async fn perfect_measurements_arrive_where_the_linear_model_says() {
         });
         let report = try_fly(&mission, few(1)).await.expect("a flight");
         let flight = &report.campaigns[0].flights[0];
-        assert_eq!(flight.samples[0].truth, flight.samples[0].measured);
+        // The truth has been to inertial axes and back: rounding of 1e8 m.
+        let start = &flight.samples[0];
+        let pairs = start.truth.iter().zip(&start.measured);
+        assert!(pairs.into_iter().all(|(is, seen)| (is - seen).abs() < 1e-6), "{start:?}");
         let blind = flight.open_loop.final_distance_m;
         assert!(blind < limit_m, "{name}: {blind} m from the burns alone");
         assert!(flight.final_distance_m < limit_m, "{name}: {} m", flight.final_distance_m);

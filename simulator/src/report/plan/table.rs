@@ -229,9 +229,9 @@ fn certificate(proof: &v1::PlanCertificate, how: Option<&v1::PlanDiagnostics>) -
         }
     });
     format!(
-        "  certificate {passed}, recomputed without the solver: {optimal}, relative gap {:.1e}{found}\n  \
-         trace {}; end of the nominal trajectory off by {:.1e} of the mission's size; least margin \
-         of a burn {:.5} m/s\n",
+        "  certificate {passed}, recomputed without the solver: {optimal}, relative gap \
+         {:.1e}{found}\n  trace {}; end of the nominal trajectory off by {:.1e} of the mission's \
+         size; least margin of a burn {:.5} m/s\n",
         proof.relative_gap,
         number(proof.trace),
         proof.dynamics_residual_nd,
