@@ -85,19 +85,81 @@ pub(crate) fn solve_lower_right(right: &DMatrix<f64>, lower: &DMatrix<f64>) -> D
     x
 }
 
-/// Orthonormal columns that span the range of A: left singular vectors whose singular values
-/// exceed `cut_off` of the largest.
-pub(crate) fn range(a: &DMatrix<f64>, cut_off: f64) -> DMatrix<f64> {
-    let scale = a.amax();
-    if a.ncols() == 0 || scale == 0.0 {
-        return DMatrix::zeros(a.nrows(), 0);
+/// A = U R with U orthogonal (m x m) and the rows of R (m x n) orthogonal to each other: the
+/// singular value decomposition by one-sided rotations (Hestenes), for few rows and any number of
+/// columns. The lengths of R's rows are the singular values, in no order. Weak directions stay
+/// accurate beside strong ones, which a decomposition through a bidiagonal form does not promise.
+fn orthogonal_rows(a: &DMatrix<f64>) -> (DMatrix<f64>, DMatrix<f64>) {
+    let (m, n) = a.shape();
+    let (mut u, mut rows) = (DMatrix::identity(m, m), a.clone());
+    let dot = |rows: &DMatrix<f64>, p: usize, q: usize| -> f64 {
+        (0..n).map(|k| rows[(p, k)] * rows[(q, k)]).sum()
+    };
+    // As with Jacobi's rotations, a dozen sweeps have always been enough.
+    for _ in 0..60 {
+        let mut rotated = false;
+        for p in 0..m {
+            for q in p + 1..m {
+                let (pp, qq, pq) = (dot(&rows, p, p), dot(&rows, q, q), dot(&rows, p, q));
+                if pq.abs() <= 4.0 * f64::EPSILON * (pp * qq).sqrt() {
+                    continue;
+                }
+                rotated = true;
+                let theta = (qq - pp) / (2.0 * pq);
+                let t = theta.signum() / (theta.abs() + libm::hypot(theta, 1.0));
+                let c = 1.0 / libm::hypot(t, 1.0);
+                let s = t * c;
+                for k in 0..n {
+                    let (a, b) = (rows[(p, k)], rows[(q, k)]);
+                    rows[(p, k)] = c * a - s * b;
+                    rows[(q, k)] = s * a + c * b;
+                }
+                for k in 0..m {
+                    let (a, b) = (u[(k, p)], u[(k, q)]);
+                    u[(k, p)] = c * a - s * b;
+                    u[(k, q)] = s * a + c * b;
+                }
+            }
+        }
+        if !rotated {
+            break;
+        }
     }
-    let svd = (a / scale).svd(true, false);
-    let least = cut_off * svd.singular_values.amax();
-    let Some(u) = svd.u else { return DMatrix::zeros(a.nrows(), 0) };
-    let kept: Vec<usize> =
-        (0..svd.singular_values.len()).filter(|&i| svd.singular_values[i] > least).collect();
+    (u, rows)
+}
+
+/// Which rows of R count: singular values above `cut_off` of the largest.
+fn counted_rows(rows: &DMatrix<f64>, cut_off: f64) -> Vec<(usize, f64)> {
+    let lengths: Vec<f64> =
+        rows.row_iter().map(|row| row.iter().map(|x| x * x).sum::<f64>().sqrt()).collect();
+    let largest = lengths.iter().fold(0.0, |a: f64, &b| a.max(b));
+    let kept = lengths.into_iter().enumerate().filter(|&(_, l)| l > cut_off * largest);
+    kept.collect()
+}
+
+/// Orthonormal columns that span the range of A (few rows): left singular vectors whose singular
+/// values exceed `cut_off` of the largest.
+pub(crate) fn range(a: &DMatrix<f64>, cut_off: f64) -> DMatrix<f64> {
+    let (u, rows) = orthogonal_rows(a);
+    let kept: Vec<usize> = counted_rows(&rows, cut_off).into_iter().map(|(row, _)| row).collect();
     u.select_columns(&kept)
+}
+
+/// The X of least size for which A X is nearest to B, A with few rows: pseudo-inverse times B, by
+/// singular values above 1e-12 of the largest.
+pub(crate) fn least_answer(a: &DMatrix<f64>, b: &DMatrix<f64>) -> DMatrix<f64> {
+    let (u, rows) = orthogonal_rows(a);
+    let mut answer = DMatrix::zeros(a.ncols(), b.ncols());
+    for (row, length) in counted_rows(&rows, 1e-12) {
+        for column in 0..b.ncols() {
+            let along: f64 = (0..a.nrows()).map(|k| u[(k, row)] * b[(k, column)]).sum();
+            let size = along / (length * length);
+            for k in 0..a.ncols() {
+                answer[(k, column)] += rows[(row, k)] * size;
+            }
+        }
+    }
+    answer
 }
 
 /// Eigenvalues of a small symmetric matrix, least first: Jacobi's rotations in cyclic order, which

@@ -34,9 +34,10 @@ const DANTZIG_PIVOTS: usize = 500;
 /// Pivots before giving up.
 const PIVOTS_MAX: usize = 5_000;
 /// Reduced costs above minus this are not negative; costs are 0 or 1.
-const COST_TOLERANCE: f64 = 1e-11;
-/// What phase 1 may leave of the right side.
-const RESIDUAL_TOLERANCE: f64 = 1e-10;
+const COST_TOLERANCE: f64 = 1e-12;
+/// What phase 1 may leave of the right side: rounding, because at the edge of feasibility a pivot
+/// can magnify it a hundredfold.
+const RESIDUAL_TOLERANCE: f64 = 1e-13;
 
 /// Solves the program: `columns` is B (m x n), `right` r (m), `limits` n values, each >= 0.
 #[must_use]
@@ -204,8 +205,20 @@ impl Simplex {
                 }
             }
         }
-        self.values =
-            (0..m).map(|k| (0..m).map(|i| self.inverse[(k, i)] * rest[i]).sum()).collect();
+        // Near the least limit bases are nearly singular. The residual of an explicit inverse grows
+        // with that, two rounds of refinement bring it back to rounding.
+        self.values = vec![0.0; m];
+        for _ in 0..3 {
+            let residual: Vec<f64> = (0..m)
+                .map(|i| {
+                    let reached = self.basis.iter().zip(&self.values);
+                    rest[i] - reached.map(|(&j, x)| self.entry(i, j) * x).sum::<f64>()
+                })
+                .collect();
+            for k in 0..m {
+                self.values[k] += (0..m).map(|i| self.inverse[(k, i)] * residual[i]).sum::<f64>();
+            }
+        }
         Some(())
     }
 

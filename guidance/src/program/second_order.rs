@@ -100,9 +100,9 @@ impl ConeProgram {
         budget.check()?;
         let usual = DefaultSettings { verbose: false, max_iter: 200, ..DefaultSettings::default() };
         let tight = DefaultSettings {
-            tol_gap_abs: 1e-10,
-            tol_gap_rel: 1e-10,
-            tol_feas: 1e-10,
+            tol_gap_abs: 1e-9,
+            tol_gap_rel: 1e-9,
+            tol_feas: 1e-9,
             ..usual.clone()
         };
         let first = self.solve_with(tight);

@@ -3,5 +3,7 @@
 #![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
 
 mod disturbance_feedback_golden;
+mod disturbance_feedback_laws;
 mod golden;
 mod laws;
+mod orbital_motion;

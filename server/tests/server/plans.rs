@@ -384,7 +384,7 @@ fn measurements(plan: &Value) -> Vec<Value> {
             "elapsedS": state["elapsedS"],
         })
     };
-    let sign = |k: usize| if k % 2 == 0 { 1.0 } else { -1.0 };
+    let sign = |k: usize| if k.is_multiple_of(2) { 1.0 } else { -1.0 };
     states.iter().enumerate().map(|(k, state)| with_error(state, sign(k))).collect()
 }
 

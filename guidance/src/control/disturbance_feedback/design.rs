@@ -6,14 +6,13 @@ use super::{
     Gain, Origin, Plan, Problem,
     conic::{self, Draft},
     model::LinearModel,
-    outcome::GAP_CLOSED,
 };
 use crate::{
-    budget::Budget,
+    budget::{Budget, Interruption},
     control::{
         ConstraintFamily, Failure, Fault, Infeasibility, PrepareError, ProofRow, Relaxation,
     },
-    matrices::{product, pseudo_inverse, solve_lower_right},
+    matrices::{least_answer, product},
     program::{Impulses, least_impulses},
 };
 
@@ -21,6 +20,10 @@ use crate::{
 const LIMIT_ROUNDING: f64 = 1e-9;
 /// The fast path answers if its gap is below this: what is left is rounding, not fuel.
 const GAP_OF_FAST_PATH: f64 = 1e-9;
+
+/// A row is overdrawn beyond this share of the limit: less is the conic solver's own rounding,
+/// which the linear program for the burns takes out.
+const OVERDRAWN: f64 = 1e-7;
 
 /// Computes a plan; see [`super::plan`].
 ///
@@ -31,23 +34,105 @@ pub(super) fn design(problem: &Problem, budget: Budget<'_>) -> Result<Plan, Prep
     let model = LinearModel::of(problem)?;
     reachable(problem, &model)?;
     budget.check()?;
-    let quick = closed_form(&model).and_then(|draft| finished(problem, draft, 0));
-    let quick = match quick {
-        Some(plan) if plan.outcome().certificate.relative_gap <= GAP_OF_FAST_PATH => {
-            return Ok(plan);
-        }
-        other => other,
-    };
-    let (draft, iterations) = conic::solve(&model, problem.effort_weight, budget)?;
-    let careful =
-        draft.and_then(|draft| finished(problem, with_cheapest_burns(&model, draft), iterations));
-    // Both passed their certificates; the cheaper is the answer.
-    match (quick, careful) {
-        (Some(a), Some(b)) if a.outcome().objective <= b.outcome().objective => Ok(a),
-        (_, Some(plan)) => Ok(plan),
-        (Some(plan), None) if plan.outcome().certificate.relative_gap <= GAP_CLOSED => Ok(plan),
-        (_, None) => Err(Failure::Numerical("no plan passed its certificate".into()).into()),
+    let quick = Origin { fast_path: true, conic_iterations: 0 };
+    if let Some(plan) = closed_form(&model).and_then(|draft| finished(problem, draft, quick))
+        && plan.outcome().certificate.relative_gap <= GAP_OF_FAST_PATH
+    {
+        return Ok(plan);
     }
+    let mut search = ConicSearch { drafts: Vec::new(), iterations: 0 };
+    let failed = match search.run(problem, &model, budget) {
+        Ok(plan) => return Ok(plan),
+        Err(Failure::Interrupted(Interruption::Cancelled)) => {
+            return Err(Failure::Interrupted(Interruption::Cancelled).into());
+        }
+        Err(failure) => failure,
+    };
+    // Out of time, or defeated by numbers: a plan that is certified but not proved best still
+    // flies, and its certificate says how far from best it can be.
+    search.best_repaired(problem, &model).ok_or(failed.into())
+}
+
+/// The general way: ever more rows rationed until the answer respects every limit.
+struct ConicSearch {
+    /// Where programs ended that gave no plan.
+    drafts: Vec<Draft>,
+    iterations: usize,
+}
+
+impl ConicSearch {
+    fn run(
+        &mut self,
+        problem: &Problem,
+        model: &LinearModel,
+        budget: Budget<'_>,
+    ) -> Result<Plan, Failure> {
+        let gains = closed_form_gains(model, &vec![1.0; 3 * model.burns()]);
+        let burns = cheapest_burns(model, &[]).unwrap_or_default();
+        let mut scarce = vec![false; 3 * model.burns()];
+        let first = Draft { burns, gains };
+        let mut overdrawn = overdrawn_rows(model, &first);
+        self.drafts.push(first);
+        while !overdrawn.is_empty() {
+            overdrawn.iter().for_each(|&row| scarce[row] = true);
+            let relaxed = conic::solve(model, problem.effort_weight, &scarce, budget)?;
+            self.iterations += relaxed.iterations;
+            let Some(draft) = relaxed.draft else { break };
+            overdrawn = overdrawn_rows(model, &draft);
+            overdrawn.retain(|&row| !scarce[row]);
+            let done = overdrawn.is_empty() && relaxed.solved;
+            self.drafts.push(draft.clone());
+            if done {
+                return weakened(model, &draft.gains)
+                    .and_then(|draft| finished(problem, draft, self.origin()))
+                    .ok_or_else(|| Failure::Numerical("a plan failed its certificate".into()));
+            }
+        }
+        Err(Failure::Numerical("the conic program was not solved".into()))
+    }
+
+    fn origin(&self) -> Origin {
+        Origin { fast_path: false, conic_iterations: self.iterations }
+    }
+
+    /// The cheapest plan that weaker gains of any draft give. Gains of 0 always give one.
+    fn best_repaired(&self, problem: &Problem, model: &LinearModel) -> Option<Plan> {
+        let plans = self
+            .drafts
+            .iter()
+            .filter_map(|draft| finished(problem, weakened(model, &draft.gains)?, self.origin()));
+        plans.min_by(|a, b| a.outcome().objective.total_cmp(&b.outcome().objective))
+    }
+}
+
+/// Thrust rows (3 burn + axis) whose burn and corrections together exceed the limit.
+fn overdrawn_rows(model: &LinearModel, draft: &Draft) -> Vec<usize> {
+    let room = rooms(model, &draft.gains);
+    let burns: Vec<f64> = draft.burns.iter().flat_map(|burn| burn.data.0[0]).collect();
+    let over = |&row: &usize| burns[row].abs() > room[row] + OVERDRAWN * model.limit;
+    (0..burns.len()).filter(over).collect()
+}
+
+/// `gains` with the cheapest burns beside them, or the largest share of the gains for which there
+/// are any: a conic solver's gains may want a hair more than there is.
+fn weakened(model: &LinearModel, gains: &[Gain]) -> Option<Draft> {
+    let scaled = |share: f64| -> Vec<Gain> {
+        gains.iter().map(|gain| Gain { matrix: &gain.matrix * share, ..gain.clone() }).collect()
+    };
+    if let Some(burns) = cheapest_burns(model, gains) {
+        return Some(Draft { burns, gains: gains.to_vec() });
+    }
+    let (mut low, mut high) = (0.0, 1.0);
+    for _ in 0..30 {
+        let middle = 0.5 * (low + high);
+        if cheapest_burns(model, &scaled(middle)).is_some() {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    let gains = scaled(low);
+    cheapest_burns(model, &gains).map(|burns| Draft { burns, gains })
 }
 
 /// Fails with a fault if no impulses reach the target state, or with the least limit if the
@@ -142,30 +227,17 @@ fn closed_form_gains(model: &LinearModel, weights: &[f64]) -> Vec<Gain> {
         for (column, weight) in weights.iter().enumerate() {
             answers.column_mut(column).scale_mut(*weight);
         }
-        let (inverse, _) = pseudo_inverse(&answers);
-        let answer = product(&inverse, &model.unanswered(i));
-        for k in i + 1..model.burns() {
-            let first = 3 * (k - i - 1);
-            let scaled =
-                DMatrix::from_fn(3, 6, |r, c| -weights[first + r] * answer[(first + r, c)]);
-            let matrix = solve_lower_right(&scaled, model.disturbances[i].root());
-            gains.push(Gain { burn: k, disturbance: i, matrix });
-        }
+        let answer = least_answer(&answers, &model.unanswered(i));
+        let answer = DMatrix::from_fn(weights.len(), 6, |r, c| -weights[r] * answer[(r, c)]);
+        gains.extend(conic::gains_of(model, i, &answer));
     }
-    gains.sort_by_key(|gain| (gain.burn, gain.disturbance));
+    gains.sort_by_key(|gain: &Gain| (gain.burn, gain.disturbance));
     gains
 }
 
 /// The cheapest burns that leave room for the corrections of `gains`; `None` if there are none.
 fn cheapest_burns(model: &LinearModel, gains: &[Gain]) -> Option<Vec<Vector3<f64>>> {
-    let mut limits = vec![model.limit; 3 * model.burns()];
-    for gain in gains {
-        let correction = product(&gain.matrix, model.disturbances[gain.disturbance].root());
-        for axis in 0..3 {
-            limits[3 * gain.burn + axis] -=
-                correction.row(axis).iter().map(|x| x * x).sum::<f64>().sqrt();
-        }
-    }
+    let limits = rooms(model, gains);
     if limits.iter().any(|limit| !(*limit >= 0.0)) {
         return None;
     }
@@ -177,16 +249,20 @@ fn cheapest_burns(model: &LinearModel, gains: &[Gain]) -> Option<Vec<Vector3<f64
     }
 }
 
-/// The conic solver's gains with burns from the exact linear program, where that has a solution.
-fn with_cheapest_burns(model: &LinearModel, draft: Draft) -> Draft {
-    match cheapest_burns(model, &draft.gains) {
-        Some(burns) => Draft { burns, ..draft },
-        None => draft,
+/// What the corrections of `gains` leave of the limit, one a thrust row.
+fn rooms(model: &LinearModel, gains: &[Gain]) -> Vec<f64> {
+    let mut rooms = vec![model.limit; 3 * model.burns()];
+    for gain in gains {
+        let correction = product(&gain.matrix, model.disturbances[gain.disturbance].root());
+        for axis in 0..3 {
+            rooms[3 * gain.burn + axis] -=
+                correction.row(axis).iter().map(|x| x * x).sum::<f64>().sqrt();
+        }
     }
+    rooms
 }
 
 /// The plan, if it passes its certificate.
-fn finished(problem: &Problem, draft: Draft, conic_iterations: usize) -> Option<Plan> {
-    let origin = Origin { fast_path: conic_iterations == 0, conic_iterations };
+fn finished(problem: &Problem, draft: Draft, origin: Origin) -> Option<Plan> {
     Plan::from_burns_and_gains(problem.clone(), draft.burns, draft.gains, origin).ok()
 }

@@ -122,7 +122,7 @@ pub(super) const GAP_CLOSED: f64 = 1e-6;
 pub(super) const GAP_ROUNDING: f64 = 1e-9;
 
 /// M_i P_i (6 x 6) of every disturbance that has acted before one instant.
-type Effects = Vec<DMatrix<f64>>;
+pub(super) type Effects = Vec<DMatrix<f64>>;
 
 impl Outcome {
     /// Recomputes everything from a model, burns (m/s) and gains.
@@ -277,16 +277,13 @@ fn corrected_effects(model: &LinearModel, k: usize, effects: &Effects, gains: &[
     effects.iter().enumerate().map(corrected).collect()
 }
 
-/// An outer ellipsoid of the true state just after burn k (6 x 6, physical): the sum of the
-/// corrected effects and of the navigation error. Until the next burn the true state only coasts,
-/// so at any time before it the image of this set is as good.
-pub(super) fn shape_after_burn(model: &LinearModel, k: usize, gains: &[Gain]) -> DMatrix<f64> {
+/// The effects just after burn k.
+pub(super) fn effects_after_burn(model: &LinearModel, k: usize, gains: &[Gain]) -> Effects {
     let mut effects = Effects::new();
     for earlier in 0..k {
         effects = advanced_effects(model, earlier, &effects, gains);
     }
-    let corrected = corrected_effects(model, k, &effects, gains);
-    physical_shape(model, k, &outer_shape(model, k, &corrected, true))
+    corrected_effects(model, k, &effects, gains)
 }
 
 /// Gains are ordered by burn, then by disturbance: burn k has k of them.
@@ -314,7 +311,7 @@ fn outer_shape(
 
 /// sum_i E_i E_i' / tau_i with tau_i = size_i / sum of sizes: contains the sum of the ellipsoids
 /// E_i ball, and of all such the least trace in the measure that made the sizes.
-fn sum_shape(effects: &[&DMatrix<f64>], sizes: &[f64]) -> DMatrix<f64> {
+pub(super) fn sum_shape(effects: &[&DMatrix<f64>], sizes: &[f64]) -> DMatrix<f64> {
     let total: f64 = sizes.iter().sum();
     let rows = effects[0].nrows();
     let mut shape = DMatrix::zeros(rows, rows);

@@ -3,9 +3,9 @@
 use nalgebra::{DMatrix, DVector, Vector3};
 
 use super::{
-    ArrivalSet, Outcome, Problem, encoding,
+    ArrivalSet, Coast, Outcome, Problem, encoding,
     model::LinearModel,
-    outcome::{self, gain_count, physical_values},
+    outcome::{gain_count, physical_values},
 };
 use crate::{
     bytes::{DecodeError, Reader, Writer, crc32},
@@ -90,13 +90,18 @@ impl Plan {
         &self.model
     }
 
-    /// Shape (6 x 6, `LVLH_CCSDS`, m and m/s) of an outer ellipsoid around the nominal state just
-    /// after burn `k` that contains the true state of every flight inside the assumed errors;
-    /// `None` if there is no such burn. Its image under the coast contains the true state until the
-    /// next burn.
+    /// The coast after burn `k`, until the next instant; `None` if there is no such burn.
     #[must_use]
-    pub fn outer_shape_after_burn(&self, k: usize) -> Option<DMatrix<f64>> {
-        (k < self.burns.len()).then(|| outcome::shape_after_burn(&self.model, k, &self.gains))
+    pub fn coast(&self, k: usize) -> Option<Coast> {
+        let burn = self.burns.get(k)?;
+        Some(Coast::new(
+            &self.problem.orbit,
+            &self.model,
+            k,
+            burn,
+            &self.outcome.states,
+            &self.gains,
+        ))
     }
 
     /// A plan made elsewhere: burns and gains, checked by the certificate.

@@ -2,15 +2,13 @@
 //! chaser on the nominal trajectory, with a covariance at every state.
 //!
 //! One segment an arc between burns, because a burn is a jump in velocity that no interpolation may
-//! cross. Within an arc the motion has no input, so states and bounds at any time are images of
-//! those just after the burn.
+//! cross.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, Matrix3, Vector3};
 use vbar_guidance::{
-    control::disturbance_feedback::{Plan, PlannedState},
-    dynamics::{TschaunerHempel, yamanaka_ankersen},
+    control::disturbance_feedback::{Coast, Plan},
     epoch::Epoch,
-    frames::{InFrame, LvlhCcsds, RTN_FROM_LVLH_CCSDS, RelativeState},
+    frames::RTN_FROM_LVLH_CCSDS,
     orbit::{EARTH_MU_M3_S2, InertialState, KeplerOrbit, chaser_state},
     units::Seconds,
 };
@@ -58,11 +56,9 @@ pub(super) fn write(plan: &Plan, plan_id: &str, labels: &Labels) -> Result<Strin
         format!("ORIGINATOR = {}", labels.originator),
     ];
     let frame = ccsds_frame(orientation.axes);
-    let arcs = plan.outcome().states.windows(2);
-    let most = STATES_MAX / arcs.len().max(1);
-    for (k, ends) in arcs.enumerate() {
-        let Some(arc) = Arc::new(plan, k, ends) else { continue };
-        let points = arc.points(&problem.orbit, most);
+    let arcs = plan.burns().len();
+    for coast in (0..arcs).filter_map(|k| plan.coast(k)) {
+        let points = points(&problem.orbit, &coast, STATES_MAX / arcs);
         segment(&mut lines, &points, epoch, frame, labels);
     }
     Ok(lines.join("\n") + "\n")
@@ -113,64 +109,30 @@ fn segment(lines: &mut Vec<String>, points: &[Point], epoch: &Epoch, frame: &str
     lines.push("COVARIANCE_STOP".to_owned());
 }
 
-/// A coast between two burns.
-struct Arc<'a> {
-    from: &'a PlannedState,
-    to: &'a PlannedState,
-    /// Nominal state just after the burn, `LVLH_CCSDS`.
-    state: DVector<f64>,
-    /// Of the true state just then, `LVLH_CCSDS`.
-    covariance: DMatrix<f64>,
+/// States from just after the burn to just before the next one.
+fn points(orbit: &KeplerOrbit, coast: &Coast, most: usize) -> Vec<Point> {
+    let (start, stop) = (coast.start().seconds(), coast.end().seconds());
+    let intervals = intervals(orbit, stop - start).min(most - 1);
+    #[allow(clippy::cast_precision_loss, reason = "at most STATES_MAX")]
+    let share = |i: usize| i as f64 / intervals as f64;
+    let elapsed = |i: usize| match i {
+        // The ends are the instants themselves, to the last bit.
+        0 => start,
+        _ if i == intervals => stop,
+        _ => start + (stop - start) * share(i),
+    };
+    (0..=intervals).filter_map(|i| point(orbit, coast, Seconds::from_seconds(elapsed(i)))).collect()
 }
 
-impl<'a> Arc<'a> {
-    /// The coast after burn `k`; `None` if there is no such burn.
-    fn new(plan: &Plan, k: usize, ends: &'a [PlannedState]) -> Option<Self> {
-        let [from, to] = ends else { return None };
-        let burn = plan.burns().get(k)?;
-        let position = from.state.position_m.components;
-        let velocity = from.state.velocity_m_s.components + burn;
-        let state = DVector::from_iterator(6, position.iter().chain(&velocity).copied());
-        let covariance = plan.outer_shape_after_burn(k)? * COVARIANCE_OVER_SHAPE;
-        Some(Self { from, to, state, covariance })
-    }
-
-    /// States from just after the burn to just before the next one.
-    fn points(&self, orbit: &KeplerOrbit, most: usize) -> Vec<Point> {
-        let (start, stop) = (self.from.elapsed.seconds(), self.to.elapsed.seconds());
-        let intervals = intervals(orbit, stop - start).min(most - 1);
-        #[allow(clippy::cast_precision_loss, reason = "at most STATES_MAX")]
-        let share = |i: usize| i as f64 / intervals as f64;
-        let elapsed = |i: usize| match i {
-            // The ends are the instants themselves, to the last bit.
-            0 => start,
-            _ if i == intervals => stop,
-            _ => start + (stop - start) * share(i),
-        };
-        let at = |i: usize| self.point(orbit, Seconds::from_seconds(elapsed(i)));
-        (0..=intervals).filter_map(at).collect()
-    }
-
-    /// The chaser at `elapsed`; `None` only for an orbit without orientation, which the caller has
-    /// refused.
-    fn point(&self, orbit: &KeplerOrbit, elapsed: Seconds) -> Option<Point> {
-        let (start, now) = (self.from.true_anomaly, orbit.true_anomaly_after(elapsed));
-        let coast = Seconds::from_seconds(elapsed.seconds() - self.from.elapsed.seconds());
-        let scaled = yamanaka_ankersen(orbit, start, now, coast);
-        let transition = TschaunerHempel::new(orbit, now).physical_from_scaled()
-            * scaled
-            * TschaunerHempel::new(orbit, start).scaled_from_physical();
-        let state = &transition * &self.state;
-        let relative = RelativeState::<LvlhCcsds> {
-            position_m: InFrame::new(Vector3::new(state[0], state[1], state[2])),
-            velocity_m_s: InFrame::new(Vector3::new(state[3], state[4], state[5])),
-        };
-        let target = orbit.inertial_state_after(elapsed)?;
-        let map = inertial_from_lvlh(&target) * transition;
-        let covariance = &map * &self.covariance * map.transpose();
-        let state = chaser_state(&target, &relative.rotated(RTN_FROM_LVLH_CCSDS))?;
-        Some(Point { elapsed, state, covariance })
-    }
+/// The chaser at `elapsed`; `None` only for an orbit without orientation, which the caller has
+/// refused.
+fn point(orbit: &KeplerOrbit, coast: &Coast, elapsed: Seconds) -> Option<Point> {
+    let relative = coast.at(elapsed);
+    let target = orbit.inertial_state_after(elapsed)?;
+    let map = inertial_from_lvlh(&target);
+    let covariance = &map * (relative.outer_shape * COVARIANCE_OVER_SHAPE) * map.transpose();
+    let state = chaser_state(&target, &relative.state.rotated(RTN_FROM_LVLH_CCSDS))?;
+    Some(Point { elapsed, state, covariance })
 }
 
 fn intervals(orbit: &KeplerOrbit, duration_s: f64) -> usize {

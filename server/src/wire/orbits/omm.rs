@@ -308,7 +308,7 @@ mod tests {
             read_omm(&text).unwrap_err().into_iter().map(|fault| fault.keyword).collect();
         keywords.sort();
         let expected =
-            ["BSTAR", "ECCENTRICITY", "EPOCH", "KEEP_OUT", "OBJECT_NAME", "REF_FRAME", "line 27"];
+            ["BSTAR", "ECCENTRICITY", "EPOCH", "KEEP_OUT", "OBJECT_NAME", "REF_FRAME", "line 26"];
         assert_eq!(keywords, expected);
     }
 
