@@ -12,19 +12,23 @@ use vbar_client::{
     Client, Options,
     v1::{ComputePlanRequest, Measurement, StepRequest},
 };
+use vbar_simulator::MissionFile;
 
 use crate::{
     failure::Failure,
     json,
     mission::MissionArguments,
+    plans::{self, PlanOptions},
     session::{NodeArguments, Session},
 };
 
 /// Largest request that is read.
 const REQUEST_BYTES_MAX: u64 = 64 << 20;
 
-/// The plan starts at the mission's own first state, or at the one given. The scheme
-/// tube-optimal-control gives plan and feedback, any other its open-loop plan.
+/// For closed-loop missions the plan starts at the mission's own first state, or at the one given,
+/// and is printed as JSON; the scheme tube-optimal-control gives plan and feedback, any other its
+/// open-loop plan. For missions with disturbance feedback it is printed as a table, with
+/// its proof, and can be exported.
 #[derive(Debug, Args)]
 pub(crate) struct PlanArguments {
     #[command(flatten)]
@@ -33,6 +37,8 @@ pub(crate) struct PlanArguments {
     /// mission draws its first state by chance
     #[arg(long, value_name = "FILE")]
     initial: Option<PathBuf>,
+    #[command(flatten)]
+    options: PlanOptions,
 }
 
 /// Everything the decision needs is in the request.
@@ -64,7 +70,17 @@ pub(crate) struct HealthArguments {
 }
 
 pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
-    let mission = arguments.mission.load_for_one_scheme()?;
+    let mission = match arguments.mission.load()? {
+        MissionFile::DisturbanceFeedback(mission) => {
+            let foreign = [("--initial", arguments.initial.is_some())];
+            arguments.mission.refuse_for_plans(foreign)?;
+            return plans::plan(&mission, &arguments.mission.node, &arguments.options).await;
+        }
+        MissionFile::VariableHorizon(mission) => arguments.mission.under_one_scheme(*mission)?,
+    };
+    if let Some(name) = arguments.options.given() {
+        return Err(Failure::usage(format!("{name} is not for a closed-loop mission")));
+    }
     let initial: Measurement = match &arguments.initial {
         Some(path) => json::parse(&read(path)?)?,
         None => mission.fixed_start().ok_or_else(|| {
@@ -91,9 +107,17 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
 }
 
 pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
-    let mission = arguments.mission.load_for_one_scheme()?;
+    let problem = match arguments.mission.load()? {
+        MissionFile::DisturbanceFeedback(mission) => {
+            arguments.mission.refuse_for_plans([])?;
+            mission.problem
+        }
+        MissionFile::VariableHorizon(mission) => {
+            arguments.mission.under_one_scheme(*mission)?.problem
+        }
+    };
     let session = Session::open(&arguments.mission.node).await?;
-    let answer = session.client.precompute(mission.problem).await;
+    let answer = session.client.precompute(problem).await;
     session.close().await;
     json::print(&json::render(&answer?)?)
 }

@@ -9,6 +9,7 @@ mod failure;
 mod json;
 mod log;
 mod mission;
+mod plans;
 mod serve;
 mod session;
 mod simulate;
@@ -39,8 +40,12 @@ enum Command {
     Serve(serve::ServeArguments),
     /// Fly a mission many times against a node and report what comes out
     Simulate(simulate::SimulateArguments),
-    /// Compute a plan for a mission's first state and print it as JSON
-    Plan(calls::PlanArguments),
+    /// Compute a plan for a mission, print it, and write it as a file for others
+    Plan(Box<calls::PlanArguments>),
+    /// Check everything a plan claims, without a node; exit code 65 if a claim does not hold
+    Verify(plans::VerifyArguments),
+    /// Have a node keep a plan, if what it claims holds
+    Upload(plans::UploadArguments),
     /// Decide one command: a StepRequest as JSON in, the StepResponse as JSON out
     Step(calls::StepArguments),
     /// Make a mission's artifact on a node and print its summary as JSON
@@ -78,7 +83,9 @@ fn run(command: Command) -> Result<(), Failure> {
         match command {
             Command::Serve(arguments) => serve::serve(arguments).await,
             Command::Simulate(arguments) => simulate::simulate(arguments).await,
-            Command::Plan(arguments) => calls::plan(arguments).await,
+            Command::Plan(arguments) => calls::plan(*arguments).await,
+            Command::Verify(arguments) => plans::verify(&arguments),
+            Command::Upload(arguments) => plans::upload(arguments).await,
             Command::Step(arguments) => calls::step(arguments).await,
             Command::Precompute(arguments) => calls::precompute(arguments).await,
             Command::Health(arguments) => calls::health(arguments).await,

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use vbar_simulator::{Mission, SchemeChoice};
+use vbar_simulator::{Mission, MissionFile, SchemeChoice};
 
 use crate::{failure::Failure, session::NodeArguments};
 
@@ -23,17 +23,31 @@ pub(crate) struct MissionArguments {
 
 impl MissionArguments {
     /// The mission as its file says.
-    pub(crate) fn load(&self) -> Result<Mission, Failure> {
-        Mission::load(&self.mission).map_err(|fault| Failure::data(fault.to_string()))
+    pub(crate) fn load(&self) -> Result<MissionFile, Failure> {
+        MissionFile::load(&self.mission).map_err(|fault| Failure::data(fault.to_string()))
     }
 
     /// The mission with the one controller that was asked for.
-    pub(crate) fn load_for_one_scheme(&self) -> Result<Mission, Failure> {
-        let mission = self.load()?;
+    pub(crate) fn under_one_scheme(&self, mission: Mission) -> Result<Mission, Failure> {
         match self.scheme {
             None => Ok(mission),
             Some(SchemeChoice::All) => Err(Failure::usage("--scheme: name one")),
             Some(SchemeChoice::One(scheme)) => Ok(mission.with_scheme(scheme)),
+        }
+    }
+
+    /// Names the first option that was given although it means nothing for a mission with
+    /// disturbance feedback: `--scheme` or one of `others`.
+    pub(crate) fn refuse_for_plans(
+        &self,
+        others: impl IntoIterator<Item = (&'static str, bool)>,
+    ) -> Result<(), Failure> {
+        let scheme = ("--scheme", self.scheme.is_some());
+        match std::iter::once(scheme).chain(others).find(|(_, given)| *given) {
+            None => Ok(()),
+            Some((name, _)) => Err(Failure::usage(format!(
+                "{name} is not for a mission with disturbance feedback"
+            ))),
         }
     }
 }

@@ -7,9 +7,17 @@ use std::{
 
 use clap::{Args, ValueEnum};
 use vbar_client::v1::HorizonSearch;
-use vbar_simulator::{Mission, ProgressBar, Report, RunOptions, draw};
+use vbar_simulator::{
+    Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar, Report, RunOptions, draw,
+};
 
-use crate::{failure::Failure, json, mission::MissionArguments, session::Session};
+use crate::{
+    failure::Failure,
+    json,
+    mission::MissionArguments,
+    plans::{self, ChangeArguments, FlightOptions},
+    session::Session,
+};
 
 /// The report goes to standard output; pictures and traces go to a folder, whose files are named
 /// on standard error.
@@ -57,6 +65,8 @@ pub(crate) struct SimulateArguments {
     /// Only print the report: no pictures, and none of the runs that only they need
     #[arg(long, conflicts_with = "out")]
     no_pictures: bool,
+    #[command(flatten)]
+    changes: ChangeArguments,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -68,7 +78,7 @@ enum Search {
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
-enum Format {
+pub(crate) enum Format {
     /// For people
     Table,
     /// For programs
@@ -77,7 +87,13 @@ enum Format {
 
 /// Flies a mission and reports.
 pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure> {
-    let mission = arguments.mission.load()?;
+    let mission = match arguments.mission.load()? {
+        MissionFile::DisturbanceFeedback(mission) => return fly_plans(&mission, arguments).await,
+        MissionFile::VariableHorizon(mission) => *mission,
+    };
+    if let Some(name) = arguments.changes.given() {
+        return Err(Failure::usage(format!("{name} is not for a closed-loop mission")));
+    }
     let options = options(&arguments)?;
     let session = Session::open(&arguments.mission.node).await?;
     let progress = ProgressBar::default();
@@ -93,6 +109,31 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
         tell_pictures(&mission, &report, &folder)?;
     }
     Ok(())
+}
+
+/// Flies the plans of a mission with disturbance feedback.
+async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Result<(), Failure> {
+    let foreign = [
+        ("--search", arguments.search.is_some()),
+        ("--misalignment-deg", arguments.misalignment_deg.is_some()),
+        ("--compare-search", arguments.compare_search),
+        ("--fuel-weights", !arguments.fuel_weights.is_empty()),
+    ];
+    arguments.mission.refuse_for_plans(foreign)?;
+    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
+    let options = FlightOptions {
+        run: PlanRunOptions {
+            runs: arguments.runs,
+            seed: arguments.seed,
+            concurrency: arguments.concurrency,
+            variant: arguments.variant,
+            with_pictures: !arguments.no_pictures,
+            ..PlanRunOptions::default()
+        },
+        format: arguments.format,
+        out: (!arguments.no_pictures).then_some(folder),
+    };
+    plans::fly(mission, &arguments.mission.node, options.changed(&arguments.changes)).await
 }
 
 fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
@@ -131,7 +172,7 @@ fn tell_pictures(mission: &Mission, report: &Report, folder: &Path) -> Result<()
     Ok(())
 }
 
-fn failure(error: vbar_simulator::SimulationError) -> Failure {
+pub(crate) fn failure(error: vbar_simulator::SimulationError) -> Failure {
     use vbar_simulator::SimulationError as Error;
     let message = error.to_string();
     match error {

@@ -228,6 +228,172 @@ fn precompute_prints_the_artifact() {
     assert!((lambda_bar - 0.2671).abs() < 5e-5, "{lambda_bar}");
 }
 
+/// What `vbar plan` printed, or its complaint as the test's.
+fn planned(arguments: &[&str]) -> String {
+    let ended = output(&[&["plan"], arguments].concat());
+    assert_eq!(ended.status.code(), Some(0), "{arguments:?}: {}", text(&ended.stderr));
+    text(&ended.stdout)
+}
+
+#[test]
+fn plan_with_feedback_prints_sets_burns_and_proof() {
+    let prisma = mission("prisma.json");
+    let said = planned(&[&prisma, "--metric", "SCALED_6"]);
+    // 105.2 is the open-loop axis of [Deaconu2014, table 3]; ten instants are nine burns.
+    for part in ["with feedback", "open loop", "105.2", "certificate passed", "\n  8", "plan "] {
+        assert!(said.contains(part), "{part} is missing in\n{said}");
+    }
+    let said = planned(&[&prisma, "--instants", "6", "--format", "json"]);
+    let answer: Value = serde_json::from_str(&said).unwrap();
+    let plan = &answer["plan"]["disturbanceFeedback"];
+    assert_eq!(plan["burns"].as_array().unwrap().len(), 5);
+    assert_eq!(plan["certificate"]["passed"], true);
+    assert_eq!(answer["planId"].as_str().unwrap().len(), 64);
+}
+
+/// That there is no plan is an answer: exit code 0, and the least bound that has one.
+#[test]
+fn plan_that_does_not_exist_names_the_least_bound() {
+    for arguments in [
+        &["--variant", "6000s_as_printed"][..],
+        &["--duration", "6000"],
+        &["--variant", "6000s", "--delta-v-max", "0.2"],
+    ] {
+        let said = planned(&[&[mission("prisma.json").as_str()], arguments].concat());
+        // 0.27887 m/s is what an independent implementation found.
+        assert!(said.contains("no plan exists") && said.contains("0.2788"), "{said}");
+    }
+}
+
+#[test]
+fn plan_exported_can_be_verified_and_uploaded() {
+    let folder = tempfile::tempdir().unwrap();
+    let node = Process::start(&[]);
+    let mission = mission("simbol_x.json");
+    let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    for (format, begins) in
+        [("oem", "CCSDS_OEM_VERS"), ("ocm", "CCSDS_OCM_VERS"), ("csv", ""), ("document", "{")]
+    {
+        let out = file(format);
+        planned(&[&mission, "--export", format, "--out", &out]);
+        let written = std::fs::read_to_string(&out).unwrap();
+        assert!(written.starts_with(begins), "{format}: {written:.60}");
+        assert!(written.lines().count() > 9, "{format}: a line an instant at least");
+    }
+    planned(&[&mission, "--export", "binary", "--out", &file("binary")]);
+    let mut ids = Vec::new();
+    for name in ["document", "binary"] {
+        let verified = output(&["verify", &file(name)]);
+        assert_eq!(verified.status.code(), Some(0), "{name}: {}", text(&verified.stderr));
+        assert!(text(&verified.stdout).contains("every claim of the plan holds"));
+        let uploaded = output(&["upload", &file(name), "--server", &node.url]);
+        assert_eq!(uploaded.status.code(), Some(0), "{name}: {}", text(&uploaded.stderr));
+        let answer: Value = serde_json::from_slice(&uploaded.stdout).unwrap();
+        let id = answer["planId"].as_str().unwrap().to_owned();
+        assert!(text(&verified.stdout).contains(&id), "{name}: another id offline");
+        ids.push(id);
+    }
+    assert_eq!(ids[0], ids[1], "two forms of one plan");
+}
+
+#[test]
+fn verify_refuses_what_does_not_hold_and_says_what() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let mission = mission("simbol_x.json");
+    planned(&[&mission, "--export", "document", "--out", &file("good.json")]);
+    planned(&[&mission, "--export", "binary", "--out", &file("good.bin")]);
+
+    let good = std::fs::read_to_string(file("good.json")).unwrap();
+    let mut claim: Value = serde_json::from_str(&good).unwrap();
+    claim["plan"]["disturbanceFeedback"]["trace"] = json!(1e-3);
+    std::fs::write(file("claim.json"), claim.to_string()).unwrap();
+    let mut burn: Value = serde_json::from_str(&good).unwrap();
+    burn["plan"]["disturbanceFeedback"]["burns"][3]["deltaVMS"][0] = json!(0.5);
+    std::fs::write(file("burn.json"), burn.to_string()).unwrap();
+    let mut flipped = std::fs::read(file("good.bin")).unwrap();
+    let middle = flipped.len() / 2;
+    flipped[middle] ^= 1;
+    std::fs::write(file("flipped.bin"), flipped).unwrap();
+    std::fs::write(file("short.json"), &good[..good.len() / 2]).unwrap();
+
+    for (name, part) in
+        [("claim.json", "trace"), ("burn.json", ""), ("flipped.bin", ""), ("short.json", "")]
+    {
+        for command in ["verify", "upload"] {
+            let ended = output(&[command, &file(name)]);
+            let said = text(&ended.stderr);
+            assert_eq!(ended.status.code(), Some(65), "{command} {name}: {said}");
+            assert!(said.contains(part), "{command} {name}: {said}");
+            assert!(ended.stdout.is_empty());
+        }
+    }
+    let nowhere = output(&["verify", "nowhere.json"]);
+    assert_eq!(nowhere.status.code(), Some(65));
+    assert!(text(&nowhere.stderr).contains("nowhere.json"));
+}
+
+#[test]
+fn plan_options_that_do_not_fit_exit_64_and_are_named() {
+    let (prisma, envisat) = (mission("prisma.json"), mission("envisat.json"));
+    for (arguments, part) in [
+        (&["plan", &prisma, "--metric", "FANCY"][..], "SCALED_6"),
+        (&["plan", &prisma, "--variant", "moon"], "6000s_as_printed"),
+        (&["plan", &prisma, "--export", "oem"], "--out"),
+        (&["plan", &prisma, "--export", "pdf", "--out", "x"], "binary"),
+        (&["plan", &prisma, "--table", "--variant", "9000s"], "--table"),
+        (&["plan", &prisma, "--scheme", "nominal"], "--scheme"),
+        (&["plan", &envisat, "--table"], "--table"),
+        (&["plan", &envisat, "--metric", "POSITION"], "--metric"),
+        (&["simulate", &envisat, "--instants", "6"], "--instants"),
+        (&["simulate", &prisma, "--compare-search"], "--compare-search"),
+        (&["simulate", &prisma, "--variant", "moon"], "6000s_as_printed"),
+    ] {
+        let ended = output(arguments);
+        let said = text(&ended.stderr);
+        assert_eq!(ended.status.code(), Some(64), "{arguments:?}: {said}");
+        assert!(said.contains(part), "{arguments:?}: {said}");
+    }
+    // What the node refuses comes back with its field.
+    let ended = output(&["plan", &prisma, "--duration", "-5"]);
+    assert_eq!(ended.status.code(), Some(65));
+    assert!(text(&ended.stderr).contains("duration_s"), "{}", text(&ended.stderr));
+}
+
+#[test]
+fn plan_table_prints_every_column_beside_the_papers() {
+    let prisma = mission("prisma.json");
+    let said = planned(&[&prisma, "--table"]);
+    // The printed figures of [Deaconu2014, table 3].
+    for part in ["3.66", "5.77", "8.76", "17.49", "35.03", "56.82", "70.08", "105.2", "no plan"] {
+        assert!(said.contains(part), "{part} is missing in\n{said}");
+    }
+    let said = planned(&[&prisma, "--table", "--metric", "POSITION", "--format", "json"]);
+    let rows: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(rows.as_array().unwrap().len(), 5);
+    assert_eq!(rows[4]["metric"], "POSITION");
+    assert!(rows[4]["in_plane_semi_axes_m"][0].as_f64().unwrap() > 0.0);
+}
+
+#[test]
+fn simulate_flies_plans_and_writes_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().to_str().unwrap();
+    let arguments = ["--runs", "2", "--variant", "8000s_n6", "--format", "json", "--out", out];
+    let flown = vbar(&["simulate", &mission("simbol_x.json")]).args(arguments).output().unwrap();
+    assert_eq!(flown.status.code(), Some(0), "{}", text(&flown.stderr));
+    let report: Value = serde_json::from_slice(&flown.stdout).unwrap();
+    assert_eq!((&report["runs"], &report["inside_arrival_set"]), (&json!(2), &json!(2)));
+    let written = std::fs::read_to_string(folder.path().join("simbol_x_report.json")).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&written).unwrap(), report);
+    for name in
+        ["simbol_x_8000s_n6_trajectories.svg", "simbol_x_8000s_n6_runs.csv", "simbol_x_axes.svg"]
+    {
+        assert!(folder.path().join(name).exists(), "{name}");
+        assert!(text(&flown.stderr).contains(name), "{name}");
+    }
+}
+
 /// The nominal next state of the double integrator: the first row after the present one.
 fn expected(prediction: &vbar_client::v1::Prediction) -> Measurement {
     measured_at(prediction.states_nd.as_ref().unwrap().values[2..4].to_vec())

@@ -17,9 +17,11 @@ use vbar_proto::{
         operations_client::OperationsClient,
     },
     v1::{
-        Artifact, ComputePlanRequest, ComputePlanResponse, GetArtifactRequest,
-        GetServerInfoRequest, GetServerInfoResponse, PrecomputeRequest, PrecomputeResponse,
-        Problem, StepRequest, StepResponse, guidance_service_client::GuidanceServiceClient,
+        Artifact, ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
+        GetArtifactRequest, GetPlanRequest, GetPlanResponse, GetServerInfoRequest,
+        GetServerInfoResponse, ListPlansRequest, ListPlansResponse, PrecomputeRequest,
+        PrecomputeResponse, Problem, StepRequest, StepResponse, UploadPlanRequest,
+        UploadPlanResponse, guidance_service_client::GuidanceServiceClient,
         step_stream_request::Controller,
     },
 };
@@ -119,6 +121,62 @@ impl Client {
         self.call(self.options.deadline, request, |request| {
             let mut guidance = self.guidance.clone();
             async move { guidance.compute_plan(request).await }
+        })
+        .await
+    }
+
+    /// Keeps a plan made elsewhere, if what it claims holds.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` with every claim that does not hold; [`Error`], as every call.
+    pub async fn upload_plan(
+        &self,
+        request: UploadPlanRequest,
+    ) -> Result<UploadPlanResponse, Error> {
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.upload_plan(request).await }
+        })
+        .await
+    }
+
+    /// A kept plan with its mission.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` if the node does not have it; [`Error`], as every call.
+    pub async fn get_plan(&self, plan_id: &str) -> Result<GetPlanResponse, Error> {
+        let request = GetPlanRequest { plan_id: plan_id.to_owned() };
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.get_plan(request).await }
+        })
+        .await
+    }
+
+    /// A page of kept plans.
+    ///
+    /// # Errors
+    /// [`Error`], as every call.
+    pub async fn list_plans(&self, request: ListPlansRequest) -> Result<ListPlansResponse, Error> {
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.list_plans(request).await }
+        })
+        .await
+    }
+
+    /// A kept plan as a document.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` if the node does not have it; `FAILED_PRECONDITION` if its mission lacks what
+    /// the format needs; [`Error`], as every call.
+    pub async fn export_plan(
+        &self,
+        request: ExportPlanRequest,
+    ) -> Result<ExportPlanResponse, Error> {
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.export_plan(request).await }
         })
         .await
     }

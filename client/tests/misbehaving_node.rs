@@ -24,10 +24,11 @@ use vbar_proto::{
         rpc,
     },
     v1::{
-        Artifact, ComputePlanRequest, ComputePlanResponse, GetArtifactRequest, GetArtifactResponse,
-        GetServerInfoRequest, GetServerInfoResponse, Measurement, PrecomputeRequest,
-        PrecomputeResponse, Problem, StepRequest, StepResponse, StepStreamRequest,
-        StepStreamResponse,
+        Artifact, ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
+        GetArtifactRequest, GetArtifactResponse, GetPlanRequest, GetPlanResponse,
+        GetServerInfoRequest, GetServerInfoResponse, ListPlansRequest, ListPlansResponse,
+        Measurement, PrecomputeRequest, PrecomputeResponse, Problem, StepRequest, StepResponse,
+        StepStreamRequest, StepStreamResponse, UploadPlanRequest, UploadPlanResponse,
         guidance_service_server::{GuidanceService, GuidanceServiceServer},
         precompute_response::Outcome,
         step_stream_request::Controller,
@@ -110,6 +111,41 @@ impl GuidanceService for Scripted {
     ) -> Result<Response<ComputePlanResponse>, Status> {
         self.follow(&request).await?;
         Ok(Response::new(ComputePlanResponse::default()))
+    }
+
+    async fn upload_plan(
+        &self,
+        request: Request<UploadPlanRequest>,
+    ) -> Result<Response<UploadPlanResponse>, Status> {
+        self.follow(&request).await?;
+        Ok(Response::new(UploadPlanResponse { plan_id: "kept".into(), certificate: None }))
+    }
+
+    async fn get_plan(
+        &self,
+        request: Request<GetPlanRequest>,
+    ) -> Result<Response<GetPlanResponse>, Status> {
+        self.follow(&request).await?;
+        let plan_id = request.into_inner().plan_id;
+        Ok(Response::new(GetPlanResponse { plan_id, ..GetPlanResponse::default() }))
+    }
+
+    async fn list_plans(
+        &self,
+        request: Request<ListPlansRequest>,
+    ) -> Result<Response<ListPlansResponse>, Status> {
+        self.follow(&request).await?;
+        let next_page_token = request.into_inner().page_token;
+        Ok(Response::new(ListPlansResponse { plans: Vec::new(), next_page_token }))
+    }
+
+    async fn export_plan(
+        &self,
+        request: Request<ExportPlanRequest>,
+    ) -> Result<Response<ExportPlanResponse>, Status> {
+        self.follow(&request).await?;
+        let file_name = request.into_inner().plan_id;
+        Ok(Response::new(ExportPlanResponse { file_name, ..ExportPlanResponse::default() }))
     }
 
     async fn precompute(
@@ -264,6 +300,32 @@ async fn step_unavailable_twice_is_answered_at_the_third_attempt() {
     let answer = client.step(StepRequest::default()).await.unwrap();
     assert_eq!(answer.step_index, 7);
     assert_eq!(node.calls(), 3);
+}
+
+/// Each call on plans survives one interruption and brings its own answer.
+#[tokio::test]
+async fn plan_calls_are_repeated_and_answered() {
+    let node = Scripted::new([unavailable()]);
+    let client = connected(&node).await;
+    let kept = client.upload_plan(UploadPlanRequest::default()).await.unwrap();
+    assert_eq!((kept.plan_id.as_str(), node.calls()), ("kept", 2));
+
+    let node = Scripted::new([unavailable()]);
+    let client = connected(&node).await;
+    assert_eq!(client.get_plan("p1").await.unwrap().plan_id, "p1");
+    assert_eq!(node.calls(), 2);
+
+    let node = Scripted::new([unavailable()]);
+    let client = connected(&node).await;
+    let page = ListPlansRequest { page_token: "next".into(), ..ListPlansRequest::default() };
+    assert_eq!(client.list_plans(page).await.unwrap().next_page_token, "next");
+    assert_eq!(node.calls(), 2);
+
+    let node = Scripted::new([unavailable()]);
+    let client = connected(&node).await;
+    let request = ExportPlanRequest { plan_id: "p2".into(), ..ExportPlanRequest::default() };
+    assert_eq!(client.export_plan(request).await.unwrap().file_name, "p2");
+    assert_eq!(node.calls(), 2);
 }
 
 #[tokio::test]

@@ -4,9 +4,10 @@
 //! mathematics behind it: plant, scaling, docking cone and reference motion are written a second
 //! time, from the papers, so that one wrong sign cannot hide in both.
 //!
-//! A mission file ([`Mission`]) says what the service is asked and against which truth it is
-//! flown; [`simulate`] flies it, many runs at once; the [`Report`] holds every trace, the
-//! statistics and the published figures; [`draw`] makes pictures of it.
+//! A mission file ([`MissionFile`]) says what the service is asked and against which truth it is
+//! flown. Closed loops ([`Mission`]) are flown by [`simulate`], plans ([`PlanMission`]) by
+//! [`fly_plans`], many runs at once; the [`Report`] or [`PlanReport`] holds every trace, the
+//! statistics and the published figures; [`draw`] and [`draw_plans`] make pictures of it.
 
 mod campaign;
 mod mission;
@@ -18,12 +19,22 @@ pub use campaign::{
     Campaign, Flight, Progress, ProgressBar, RunOptions, SchemeChoice, Silent, SimulationError,
     SweepPoint,
     flight::{Outcome, Sample, Step, VIOLATION_TOLERANCE_ND},
+    plan::{
+        FlownBurn, OpenLoopEnd, PlanAnswer, PlanCampaign, PlanFlight, PlanRow, PlanRunOptions,
+        PlanSample, Planned, compute_plan, compute_table, fly_plans,
+    },
     search::SearchComparison,
     simulate,
 };
-pub use mission::{Mission, MissionError, Published, RUNS_MAX};
-pub use pictures::{PictureError, draw};
-pub use report::{Report, Statistics, Summary};
+pub use mission::{
+    Mission, MissionError, MissionFile, PlanChanges, PlanMission, Published, PublishedAxes,
+    RUNS_MAX, metric_name, metric_named,
+};
+pub use pictures::{PictureError, draw, plan::draw_plans};
+pub use report::{
+    Report, Statistics, Summary,
+    plan::{PlanReport, PlanSummary, plan_rows_json, plan_rows_text, plan_text},
+};
 
 #[cfg(test)]
 mod tests {

@@ -273,18 +273,18 @@ pub(crate) fn stream_of_chance(seed: u64, run: u32, purpose: u64) -> ChaCha12Rng
 }
 
 /// A node that is busy says RESOURCE_EXHAUSTED at once; it is asked again a little later.
-struct Patience {
+pub(crate) struct Patience {
     run: u32,
     attempts: u32,
 }
 
 impl Patience {
-    fn new(run: u32) -> Self {
+    pub(crate) fn new(run: u32) -> Self {
         Self { run, attempts: 0 }
     }
 
     /// Waits if the node was busy; any other error, or too many, ends the run.
-    async fn after(&mut self, error: vbar_client::Error) -> Result<(), SimulationError> {
+    pub(crate) async fn after(&mut self, error: vbar_client::Error) -> Result<(), SimulationError> {
         self.attempts += 1;
         if error.code != Code::ResourceExhausted || self.attempts >= BUSY_ATTEMPTS_MAX {
             return Err(SimulationError::Client { run: self.run, source: error });

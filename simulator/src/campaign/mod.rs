@@ -2,22 +2,16 @@
 //!
 //! A run depends on the seed and on its own number, never on how many others fly beside it.
 
+pub(crate) mod crew;
 pub(crate) mod flight;
+pub(crate) mod plan;
 pub(crate) mod progress;
 pub(crate) mod search;
 pub(crate) mod sets;
 pub(crate) mod vehicle;
 
-use std::{
-    collections::BTreeMap,
-    num::NonZeroUsize,
-    sync::{
-        Arc,
-        atomic::{AtomicU32, Ordering},
-    },
-};
+use std::{num::NonZeroUsize, sync::Arc};
 
-use tokio::{sync::mpsc, task::JoinSet};
 use vbar_client::Client;
 use vbar_proto::v1::{
     self, HorizonSearch, VariableHorizonArtifact, VariableHorizonScheme as Scheme,
@@ -29,6 +23,7 @@ use crate::{
     },
     report::Report,
 };
+use crew::Crew;
 pub use flight::Flight;
 pub use progress::{Progress, ProgressBar, Silent};
 
@@ -171,7 +166,7 @@ pub async fn simulate(
     if !(1..=RUNS_MAX).contains(&runs) {
         return Err(SimulationError::Options(format!("runs: 1 to {RUNS_MAX}, got {runs}")));
     }
-    let concurrency = concurrency(client, options).await?;
+    let concurrency = concurrency(client, options.concurrency).await?;
     let mut campaigns = Vec::new();
     for scheme in chosen_schemes(&mission, options)? {
         let plan = Plan::new(&mission, options, scheme, concurrency);
@@ -232,8 +227,11 @@ fn chosen_schemes(mission: &Mission, options: &RunOptions) -> Result<Vec<Scheme>
 }
 
 /// As many runs at once as asked for, else by what the server says it computes at once.
-async fn concurrency(client: &Client, options: &RunOptions) -> Result<usize, SimulationError> {
-    if let Some(asked) = options.concurrency {
+async fn concurrency(
+    client: &Client,
+    asked: Option<NonZeroUsize>,
+) -> Result<usize, SimulationError> {
+    if let Some(asked) = asked {
         return Ok(asked.get().min(CONCURRENCY_MAX));
     }
     let info = client.server_info().await;
@@ -328,8 +326,9 @@ impl Plan {
         progress: &dyn Progress,
     ) -> Result<Campaign, SimulationError> {
         let scheme = self.mission.scheme();
-        let flown = self
-            .in_parallel(client, runs, label, progress, |client, plan, run| async move {
+        let crew = Crew { concurrency: self.concurrency, client, progress };
+        let flown = crew
+            .each(Arc::new(self), runs, label, |client, plan, run| async move {
                 flight::fly(&client, &plan, run).await
             })
             .await?;
@@ -351,62 +350,13 @@ impl Plan {
         progress: &dyn Progress,
     ) -> Result<search::SearchComparison, SimulationError> {
         let label = "LOCAL against ENUMERATION";
-        let counted = self
-            .in_parallel(client, runs, label, progress, |client, plan, run| async move {
+        let crew = Crew { concurrency: self.concurrency, client, progress };
+        let counted = crew
+            .each(Arc::new(self), runs, label, |client, plan, run| async move {
                 search::compare(&client, &plan, run).await
             })
             .await?;
         Ok(counted.into_iter().sum())
-    }
-
-    /// Calls `job` for every run, `concurrency` of them at a time; results in order of the run.
-    async fn in_parallel<T, F, Job>(
-        self,
-        client: &Client,
-        runs: u32,
-        label: &str,
-        progress: &dyn Progress,
-        job: Job,
-    ) -> Result<Vec<T>, SimulationError>
-    where
-        T: Send + 'static,
-        F: Future<Output = Result<T, SimulationError>> + Send + 'static,
-        Job: Fn(Client, Arc<Plan>, u32) -> F + Clone + Send + Sync + 'static,
-    {
-        progress.begin(label, u64::from(runs));
-        let concurrency = self.concurrency;
-        let plan = Arc::new(self);
-        let next = Arc::new(AtomicU32::new(0));
-        let (sender, mut results) = mpsc::channel(concurrency);
-        let mut workers = JoinSet::new();
-        for _ in 0..concurrency {
-            let (client, plan, next) = (client.clone(), plan.clone(), next.clone());
-            let (sender, job) = (sender.clone(), job.clone());
-            workers.spawn(async move {
-                loop {
-                    let run = next.fetch_add(1, Ordering::Relaxed);
-                    if run >= runs {
-                        return;
-                    }
-                    let result = job(client.clone(), plan.clone(), run).await;
-                    // The receiver is gone only when another run has failed already.
-                    if sender.send((run, result)).await.is_err() {
-                        return;
-                    }
-                }
-            });
-        }
-        drop(sender);
-        let mut done = BTreeMap::new();
-        while let Some((run, result)) = results.recv().await {
-            done.insert(run, result?);
-            progress.advance();
-        }
-        while let Some(ended) = workers.join_next().await {
-            ended?;
-        }
-        progress.end();
-        Ok(done.into_values().collect())
     }
 }
 

@@ -2,11 +2,14 @@
 //! the published figures printed beside ours.
 //!
 //! Top level: `name`, `description` (where the numbers come from, and what the paper leaves open),
-//! `problem` (canonical JSON of `vbar.v1.Problem`), `simulation`, `published`. Unknown fields are
-//! refused everywhere.
+//! `problem` (canonical JSON of `vbar.v1.Problem`), `simulation`, `published`. The last two mean
+//! what the problem's method needs: see [`Mission`] and [`PlanMission`]. Unknown fields are refused
+//! everywhere.
 
 pub(crate) mod law;
 pub(crate) mod model;
+pub(crate) mod plan;
+pub(crate) mod plan_model;
 mod start;
 
 use std::{collections::BTreeMap, fs, path::Path};
@@ -20,6 +23,7 @@ use vbar_proto::{
 
 use law::{DisturbanceLaw, InitialLaw, Randomisation, TruthLaw};
 use model::Model;
+pub use plan::{PlanChanges, PlanMission, PublishedAxes, metric_name, metric_named};
 
 /// Largest mission file that is read.
 const FILE_BYTES_MAX: u64 = 16 << 20;
@@ -27,7 +31,75 @@ const FILE_BYTES_MAX: u64 = 16 << 20;
 /// Most runs of one campaign.
 pub const RUNS_MAX: u32 = 100_000;
 
-/// A parsed and checked mission.
+/// A mission of whichever method its problem names.
+#[derive(Debug, Clone)]
+pub enum MissionFile {
+    /// Closed loops under variable-horizon control.
+    VariableHorizon(Box<Mission>),
+    /// Fixed-time plans with disturbance feedback.
+    DisturbanceFeedback(Box<PlanMission>),
+}
+
+impl MissionFile {
+    /// Reads and checks a mission file.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is not of the right shape, or names values that make no
+    /// sense; every such value is listed.
+    pub fn load(path: &Path) -> Result<Self, MissionError> {
+        Self::parse(&read(path)?)
+    }
+
+    /// Checks the text of a mission file.
+    ///
+    /// # Errors
+    /// As [`MissionFile::load`].
+    pub fn parse(text: &str) -> Result<Self, MissionError> {
+        /// Which arm the problem has, before anything else is looked at.
+        #[derive(Deserialize)]
+        struct Head {
+            problem: BTreeMap<String, serde::de::IgnoredAny>,
+        }
+        let head: Head = serde_json::from_str(text)?;
+        let arms = ["disturbanceFeedback", "disturbance_feedback"];
+        if arms.iter().any(|arm| head.problem.contains_key(*arm)) {
+            return PlanMission::parse(text)
+                .map(|mission| Self::DisturbanceFeedback(mission.into()));
+        }
+        Mission::parse(text).map(|mission| Self::VariableHorizon(mission.into()))
+    }
+
+    /// Short name, used in file names.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        match self {
+            Self::VariableHorizon(mission) => &mission.name,
+            Self::DisturbanceFeedback(mission) => &mission.name,
+        }
+    }
+
+    /// What the service is asked.
+    #[must_use]
+    pub fn into_problem(self) -> v1::Problem {
+        match self {
+            Self::VariableHorizon(mission) => mission.problem,
+            Self::DisturbanceFeedback(mission) => mission.problem,
+        }
+    }
+}
+
+/// The text of a mission file of acceptable size.
+fn read(path: &Path) -> Result<String, MissionError> {
+    let unreadable = |source| MissionError::Unreadable { path: path.display().to_string(), source };
+    let size = fs::metadata(path).map_err(unreadable)?.len();
+    if size > FILE_BYTES_MAX {
+        let fault = format!("the file has {size} bytes, at most {FILE_BYTES_MAX} are read");
+        return Err(MissionError::Invalid(vec![fault]));
+    }
+    fs::read_to_string(path).map_err(unreadable)
+}
+
+/// A parsed and checked mission of the variable-horizon method.
 #[derive(Debug, Clone)]
 pub struct Mission {
     /// Short name, used in file names.
@@ -120,7 +192,7 @@ pub(crate) struct Variant {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct MissionFile {
+struct ClosedLoopFile {
     name: String,
     description: String,
     problem: serde_json::Value,
@@ -136,14 +208,7 @@ impl Mission {
     /// When the file cannot be read, is not of the right shape, or names values that make no
     /// sense; every such value is listed.
     pub fn load(path: &Path) -> Result<Self, MissionError> {
-        let unreadable =
-            |source| MissionError::Unreadable { path: path.display().to_string(), source };
-        let size = fs::metadata(path).map_err(unreadable)?.len();
-        if size > FILE_BYTES_MAX {
-            let fault = format!("the file has {size} bytes, at most {FILE_BYTES_MAX} are read");
-            return Err(MissionError::Invalid(vec![fault]));
-        }
-        Self::parse(&fs::read_to_string(path).map_err(unreadable)?)
+        Self::parse(&read(path)?)
     }
 
     /// Checks the text of a mission file.
@@ -151,7 +216,7 @@ impl Mission {
     /// # Errors
     /// As [`Mission::load`].
     pub fn parse(text: &str) -> Result<Self, MissionError> {
-        let file: MissionFile = serde_json::from_str(text)?;
+        let file: ClosedLoopFile = serde_json::from_str(text)?;
         let problem = parse_problem(file.problem)?;
         let mission = Self {
             name: file.name,
@@ -204,10 +269,7 @@ impl Mission {
 
     pub(crate) fn check(&self) -> Result<(), MissionError> {
         let mut faults = Vec::new();
-        let name_ok = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-        if self.name.is_empty() || !self.name.chars().all(name_ok) {
-            faults.push("name: letters, digits, '_' and '-' only".to_owned());
-        }
+        check_name(&self.name, &mut faults);
         let compared = &self.simulation.compared_schemes;
         for name in compared.iter().filter(|name| scheme_named(name).is_none()) {
             faults.push(format!("simulation.compared_schemes: no scheme is called {name}"));
@@ -256,6 +318,14 @@ impl Mission {
     }
 }
 
+/// A name goes into file names.
+fn check_name(name: &str, faults: &mut Vec<String>) {
+    let ok = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if name.is_empty() || !name.chars().all(ok) {
+        faults.push("name: letters, digits, '_' and '-' only".to_owned());
+    }
+}
+
 fn check_runs(place: &str, runs: u32, faults: &mut Vec<String>) {
     if !(1..=RUNS_MAX).contains(&runs) {
         faults.push(format!("{place}: 1 to {RUNS_MAX}, got {runs}"));
@@ -277,7 +347,7 @@ pub(crate) fn scheme_name(scheme: Scheme) -> &'static str {
 pub(crate) fn variable_horizon(problem: &v1::Problem) -> Option<&v1::VariableHorizonProblem> {
     match &problem.method {
         Some(v1::problem::Method::VariableHorizon(inner)) => Some(inner),
-        None => None,
+        Some(v1::problem::Method::DisturbanceFeedback(_)) | None => None,
     }
 }
 
@@ -287,7 +357,7 @@ pub(crate) fn variable_horizon_mut(
 ) -> Option<&mut v1::VariableHorizonProblem> {
     match &mut problem.method {
         Some(v1::problem::Method::VariableHorizon(inner)) => Some(inner),
-        None => None,
+        Some(v1::problem::Method::DisturbanceFeedback(_)) | None => None,
     }
 }
 
@@ -321,12 +391,20 @@ mod tests {
         let mut names = Vec::new();
         for entry in fs::read_dir(folder).expect("missions") {
             let path = entry.expect("entry").path();
-            let mission = Mission::load(&path).unwrap_or_else(|e| panic!("{path:?}: {e}"));
-            assert_eq!(path.file_stem().and_then(|s| s.to_str()), Some(mission.name.as_str()));
-            names.push(mission.name);
+            let mission = MissionFile::load(&path).unwrap_or_else(|e| panic!("{path:?}: {e}"));
+            assert_eq!(path.file_stem().and_then(|s| s.to_str()), Some(mission.name()));
+            names.push(mission.name().to_owned());
         }
         names.sort();
-        let expected = ["double_integrator", "envisat", "leo_tumbler", "tumbling_satellite"];
+        let expected = [
+            "double_integrator",
+            "envisat",
+            "gto",
+            "leo_tumbler",
+            "prisma",
+            "simbol_x",
+            "tumbling_satellite",
+        ];
         assert_eq!(names, expected);
     }
 

@@ -470,7 +470,7 @@ pub(crate) fn matrix(
     DMatrix::from_row_slice(rows, columns, &given.values)
 }
 
-fn three(place: &str, values: &[f64], faults: &mut Vec<String>) -> Vector3<f64> {
+pub(crate) fn three(place: &str, values: &[f64], faults: &mut Vec<String>) -> Vector3<f64> {
     match values {
         [x, y, z] if values.iter().all(|value| value.is_finite()) => Vector3::new(*x, *y, *z),
         _ => {

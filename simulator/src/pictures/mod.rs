@@ -4,6 +4,7 @@
 //! snapshots of the cone; a plane plant gets its sets; several schemes get box plots.
 
 mod chart;
+pub(crate) mod plan;
 mod plane;
 mod rendezvous;
 mod series;

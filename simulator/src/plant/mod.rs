@@ -6,6 +6,7 @@
 pub(crate) mod cone;
 pub(crate) mod hill;
 pub(crate) mod linear;
+pub(crate) mod lvlh;
 pub(crate) mod rotation;
 pub(crate) mod two_body;
 

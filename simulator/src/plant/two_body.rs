@@ -1,19 +1,23 @@
 //! Nonlinear truth: both spacecraft in an Earth-centred inertial frame, with J2.
 //!
 //! Each obeys `r'' = -mu r / |r|^3 + J2 term (+ thrust)`, integrated together by the classical
-//! Runge-Kutta method with steps of at most [`STEP_MAX_S`]. Its error per step at low orbit,
-//! about (n h)^5 / 120 |r| = 6e-11 m for h = 1 s, lies below the rounding of the positions
-//! themselves (1e-9 m), so a finer method would buy nothing.
+//! Runge-Kutta method. The step follows the lower of the two: at most [`STEP_MAX`] of its
+//! free-fall time `sqrt(r^3 / mu)`, which is about 1 s in low orbit and 45 s at the height where
+//! a highly elliptic orbit spends its time. The error per step, about `STEP_MAX^5 / 120 |r|` =
+//! 8e-18 |r|, then lies below the rounding of the positions themselves (1e-16 |r|) everywhere, so
+//! a finer method would buy nothing. Tested: within 10 micrometres of Kepler's solution after
+//! 20,000 s at any eccentricity, within 0.3 mm after the four days of a revolution at e = 0.8; of
+//! the relative motion far less, since both craft share the error.
 
 use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::{EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M};
 
-/// Longest step of the integration.
-const STEP_MAX_S: f64 = 1.0;
+/// Longest step of the integration, in free-fall times `sqrt(r^3 / mu)`.
+const STEP_MAX: f64 = 1e-3;
 
 /// Osculating Keplerian elements, angles in radians.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Elements {
     /// Semi-major axis, m.
     pub semi_major_axis_m: f64,
@@ -27,6 +31,28 @@ pub(crate) struct Elements {
     pub argument_of_perigee_rad: f64,
     /// Mean anomaly.
     pub mean_anomaly_rad: f64,
+}
+
+/// Mean anomaly where the true one is `true_anomaly_rad`, within the same revolution.
+pub(crate) fn mean_anomaly(true_anomaly_rad: f64, eccentricity: f64) -> f64 {
+    let turns = (true_anomaly_rad / std::f64::consts::TAU).round() * std::f64::consts::TAU;
+    let (s, c) = (0.5 * (true_anomaly_rad - turns)).sin_cos();
+    // tan(E / 2) = sqrt((1 - e) / (1 + e)) tan(nu / 2), free of the pole at half a turn.
+    let half = f64::atan2((1.0 - eccentricity).sqrt() * s, (1.0 + eccentricity).sqrt() * c);
+    let anomaly = 2.0 * half;
+    turns + anomaly - eccentricity * anomaly.sin()
+}
+
+/// True anomaly where the mean one is `mean_anomaly_rad`, counted on through revolutions.
+pub(crate) fn true_anomaly(mean_anomaly_rad: f64, eccentricity: f64) -> f64 {
+    let turns = (mean_anomaly_rad / std::f64::consts::TAU).round() * std::f64::consts::TAU;
+    let (s, c) = (0.5 * eccentric_anomaly(mean_anomaly_rad - turns, eccentricity)).sin_cos();
+    let half = f64::atan2((1.0 + eccentricity).sqrt() * s, (1.0 - eccentricity).sqrt() * c);
+    let anomaly = 2.0 * half;
+    // The half angle came from [0, pi]: bring the whole one back to (-pi, pi].
+    let within =
+        if anomaly > std::f64::consts::PI { anomaly - std::f64::consts::TAU } else { anomaly };
+    turns + within
 }
 
 /// Two spacecraft, and whether J2 acts.
@@ -72,12 +98,28 @@ impl TwoBody {
     /// Moves both for `duration_s`; the chaser's thrust acceleration is constant in the rotating
     /// RTN frame of the moving target.
     pub(crate) fn advance(&mut self, duration_s: f64, thrust_rtn: &Vector3<f64>) {
-        let steps = (duration_s / STEP_MAX_S).ceil().max(1.0);
-        let step = duration_s / steps;
-        // The cast is exact: a sample is at most a few thousand seconds long.
-        for _ in 0..steps as u32 {
+        let mut left = duration_s;
+        while left > 0.0 {
+            // Equal steps as far as one looks from here, so that none is left over at the end.
+            let steps = (left / self.step_max_s()).ceil();
+            let step = if steps > 1.0 { left / steps } else { left };
             self.runge_kutta(step, thrust_rtn);
+            left = if steps > 1.0 { left - step } else { 0.0 };
         }
+    }
+
+    /// Changes the chaser's velocity at once, by components in the target's RTN frame.
+    pub(crate) fn push(&mut self, delta_v_rtn_m_s: &Vector3<f64>) {
+        let change = rtn_axes(&self.target) * delta_v_rtn_m_s;
+        for row in 0..3 {
+            self.chaser[row + 3] += change[row];
+        }
+    }
+
+    fn step_max_s(&self) -> f64 {
+        let radius = |state: &Vector6<f64>| state.fixed_rows::<3>(0).norm();
+        let lower = radius(&self.target).min(radius(&self.chaser));
+        STEP_MAX * (lower.powi(3) / EARTH_MU_M3_S2).sqrt()
     }
 
     fn runge_kutta(&mut self, h: f64, thrust_rtn: &Vector3<f64>) {
@@ -203,6 +245,18 @@ mod tests {
         }
     }
 
+    /// [Deaconu2014, Table 2]: true anomaly 135 degrees.
+    fn simbol_x() -> Elements {
+        Elements {
+            semi_major_axis_m: 106_246_975.0,
+            eccentricity: 0.7988,
+            inclination_rad: 5.2_f64.to_radians(),
+            ascending_node_rad: 180.0_f64.to_radians(),
+            argument_of_perigee_rad: 90.0_f64.to_radians(),
+            mean_anomaly_rad: mean_anomaly(135.0_f64.to_radians(), 0.7988),
+        }
+    }
+
     fn circular() -> Elements {
         Elements { eccentricity: 0.0, ..envisat() }
     }
@@ -295,6 +349,64 @@ mod tests {
         assert!((order - 2.0).abs() < 0.1, "order {order}: {large} {small}");
     }
 
+    /// A burn is seen in the rotating frame exactly as it was commanded, and nothing else moves.
+    #[test]
+    fn two_body_impulse_changes_the_relative_velocity_alone() {
+        let start = Vector6::new(50.0, -20.0, 10.0, 0.1, -0.3, 0.2);
+        let mut pair = TwoBody::new(&simbol_x(), true, &start);
+        let before = pair.relative();
+        pair.push(&Vector3::new(0.3, -0.2, 0.1));
+        let change = pair.relative() - before;
+        let expected = Vector6::new(0.0, 0.0, 0.0, 0.3, -0.2, 0.1);
+        // Rounding of 3e3 m/s.
+        assert!((change - expected).amax() < 2e-12, "{change}");
+    }
+
+    /// The stated accuracy: after one revolution through perigee both are where they began.
+    #[test]
+    fn two_body_comes_back_after_one_highly_elliptic_revolution() {
+        let relative = Vector6::new(300.0, -20.0, 10.0, 0.0, 0.0, 0.0);
+        let elements = simbol_x();
+        let mut pair = TwoBody::new(&elements, false, &relative);
+        let before = pair.clone();
+        let n = (EARTH_MU_M3_S2 / elements.semi_major_axis_m.powi(3)).sqrt();
+        pair.advance(std::f64::consts::TAU / n, &Vector3::zeros());
+        let error = (pair.target - before.target).fixed_rows::<3>(0).norm();
+        assert!(error < 3e-4, "{error} m");
+        let (was, is) = (energy(&before.chaser), energy(&pair.chaser));
+        assert!((is / was - 1.0).abs() < 1e-12, "{was} {is}");
+    }
+
+    /// Kepler's problem solved in closed form is another road to the same place.
+    #[test]
+    fn two_body_agrees_with_kepler_at_any_eccentricity() {
+        for (eccentricity, mean) in [(0.0, 0.3), (0.3, 2.0), (0.7988, 0.5), (0.9, 5.5)] {
+            let start = Elements { eccentricity, mean_anomaly_rad: mean, ..simbol_x() };
+            let n = (EARTH_MU_M3_S2 / start.semi_major_axis_m.powi(3)).sqrt();
+            let mut pair = TwoBody::new(&start, false, &Vector6::zeros());
+            pair.advance(20_000.0, &Vector3::zeros());
+            let end = Elements { mean_anomaly_rad: mean + n * 20_000.0, ..start };
+            let error = (pair.target - inertial_state(&end)).fixed_rows::<3>(0).norm();
+            assert!(error < 1e-5, "e = {eccentricity}: {error} m");
+        }
+    }
+
+    #[test]
+    fn anomalies_are_each_others_inverse_and_count_revolutions() {
+        for eccentricity in [0.0, 0.004, 0.7988, 0.95] {
+            for true_rad in [-7.0, -3.1, -1e-9, 0.0, 0.5, 2.356, 3.1, 3.2, 6.0, 6.3, 40.0] {
+                let mean = mean_anomaly(true_rad, eccentricity);
+                let back = true_anomaly(mean, eccentricity);
+                assert!(
+                    (back - true_rad).abs() < 1e-12 * (1.0 + true_rad.abs()) / (1.0 - eccentricity),
+                    "e = {eccentricity}, {true_rad}: {back}"
+                );
+            }
+        }
+        // Where the two meet: half turns.
+        assert!((mean_anomaly(std::f64::consts::PI, 0.5) - std::f64::consts::PI).abs() < 1e-15);
+    }
+
     #[test]
     fn two_body_j2_turns_the_node_westward_for_a_prograde_orbit() {
         let elements = Elements { inclination_rad: 0.7, eccentricity: 0.0, ..envisat() };
@@ -311,5 +423,41 @@ mod tests {
         // First-order secular rate; short-period terms over ten orbits leave under 1 %.
         let expected = -1.5 * n * EARTH_J2 * (EARTH_RADIUS_M / 7.140e6).powi(2) * 0.7_f64.cos();
         assert!((rate / expected - 1.0).abs() < 0.01, "{rate} {expected}");
+    }
+    /// First-order secular rates of node and perigee, and of nothing else.
+    #[test]
+    fn two_body_j2_drifts_node_and_perigee_at_their_secular_rates() {
+        let elements = Elements { eccentricity: 0.3, inclination_rad: 0.5, ..envisat() };
+        let elements = Elements { semi_major_axis_m: 12e6, ..elements };
+        let mut pair = TwoBody::new(&elements, true, &Vector6::zeros());
+        let n = (EARTH_MU_M3_S2 / elements.semi_major_axis_m.powi(3)).sqrt();
+        let (before, duration) = (orientation(&pair.target), 20.0 * std::f64::consts::TAU / n);
+        pair.advance(duration, &Vector3::zeros());
+        let after = orientation(&pair.target);
+        let parameter = elements.semi_major_axis_m * (1.0 - 0.3 * 0.3);
+        let strength = n * EARTH_J2 * (EARTH_RADIUS_M / parameter).powi(2);
+        let (s, c) = 0.5_f64.sin_cos();
+        let node = -1.5 * strength * c;
+        let perigee = 0.75 * strength * (4.0 - 5.0 * s * s);
+        // Short-period terms over twenty orbits leave under 2 %.
+        let measured = [(after.0 - before.0) / duration, (after.1 - before.1) / duration];
+        assert!((measured[0] / node - 1.0).abs() < 0.02, "{measured:?} {node}");
+        assert!((measured[1] / perigee - 1.0).abs() < 0.02, "{measured:?} {perigee}");
+        assert!((after.2 - before.2).abs() < 1e-3, "inclination {} {}", before.2, after.2);
+    }
+
+    /// Osculating node, argument of perigee, inclination.
+    fn orientation(state: &Vector6<f64>) -> (f64, f64, f64) {
+        let position: Vector3<f64> = state.fixed_rows::<3>(0).into();
+        let velocity: Vector3<f64> = state.fixed_rows::<3>(3).into();
+        let h = momentum(state);
+        let perigee = velocity.cross(&h) / EARTH_MU_M3_S2 - position.normalize();
+        let node = Vector3::new(-h[1], h[0], 0.0).normalize();
+        let across = h.normalize().cross(&node);
+        (
+            h[0].atan2(-h[1]),
+            perigee.dot(&across).atan2(perigee.dot(&node)),
+            (h[2] / h.norm()).acos(),
+        )
     }
 }

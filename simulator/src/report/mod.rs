@@ -1,5 +1,6 @@
 //! What a campaign showed: numbers for programs, a table for people, traces for other tools.
 
+pub(crate) mod plan;
 mod statistics;
 mod table;
 
@@ -7,6 +8,7 @@ use std::{
     fmt::Write as _,
     fs, io,
     path::{Path, PathBuf},
+    time::Duration,
 };
 
 use hdrhistogram::Histogram;
@@ -191,7 +193,7 @@ impl Summary {
             uncertified_steps: steps().filter(|step| !step.certified).count(),
             outside_assumed_set_steps: steps().filter(|step| step.outside_assumed_set).count(),
             general_solver_calls: steps().map(|step| i64::from(step.general_solver_calls)).sum(),
-            latency_ms: latency_ms(flights),
+            latency_ms: latency_ms(steps().map(|step| step.latency)),
         }
     }
 
@@ -263,11 +265,12 @@ fn metrics(campaign: &Campaign) -> Vec<(&'static str, Statistics)> {
     all.into_iter().filter_map(|(name, statistics)| Some((name, statistics?))).collect()
 }
 
-fn latency_ms(flights: &[Flight]) -> Option<(f64, f64)> {
+/// p50 and p99, ms; `None` of nothing.
+fn latency_ms(latencies: impl IntoIterator<Item = Duration>) -> Option<(f64, f64)> {
     // Up to a minute in microseconds, three digits: always valid bounds.
     let mut histogram = Histogram::<u64>::new_with_bounds(1, 60_000_000, 3).ok()?;
-    for step in flights.iter().flat_map(|flight| &flight.steps) {
-        histogram.saturating_record(u64::try_from(step.latency.as_micros()).unwrap_or(u64::MAX));
+    for latency in latencies {
+        histogram.saturating_record(u64::try_from(latency.as_micros()).unwrap_or(u64::MAX));
     }
     let quantile = |q: f64| histogram.value_at_quantile(q) as f64 / 1e3;
     (!histogram.is_empty()).then(|| (quantile(0.5), quantile(0.99)))

@@ -161,7 +161,7 @@ fn label(metric: &str) -> String {
 }
 
 /// Four significant digits, without exponents in the usual range.
-fn number(value: f64) -> String {
+pub(super) fn number(value: f64) -> String {
     if value == 0.0 {
         return "0".into();
     }
@@ -175,7 +175,7 @@ fn number(value: f64) -> String {
 }
 
 /// Columns padded to their widest cell: the first to the left, the others to the right.
-fn align(rows: &[Vec<String>]) -> String {
+pub(super) fn align(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |column: usize| {
         rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max()

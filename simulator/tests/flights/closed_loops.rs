@@ -1,29 +1,18 @@
-//! Closed loops over real sockets: a node on a free port, the client, the simulator.
-//!
-//! Few runs each, so that the whole file stays within seconds; the full campaigns are one command
-//! away (`vbar simulate`). Bounds are wide enough for few runs and far narrower than the
-//! differences between the schemes.
+//! Closed loops. Bounds are wide enough for few runs and far narrower than the differences between
+//! the schemes.
 
-use std::path::Path;
-
-use vbar_client::Client;
 use vbar_proto::v1::VariableHorizonScheme as Scheme;
-use vbar_server::{Config, Node};
 use vbar_simulator::{
     Mission, Report, RunOptions, SchemeChoice, Silent, SimulationError, Summary, draw, simulate,
 };
 
-fn mission(name: &str) -> Mission {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("missions");
-    Mission::load(&folder.join(name)).expect(name)
-}
+use super::{mission_text, node};
 
 /// Flies against a node of its own.
 async fn try_fly(mission: &str, options: RunOptions) -> Result<Report, SimulationError> {
-    let node = Node::start(Config::default()).await.expect("a node");
-    let url = format!("http://{}", node.local_address());
-    let client = Client::connect(&url, vbar_client::Options::default()).await.expect("a client");
-    let report = simulate(&client, &self::mission(mission), &options, &Silent).await;
+    let (node, client) = node().await;
+    let mission = Mission::parse(&mission_text(mission)).expect("a mission");
+    let report = simulate(&client, &mission, &options, &Silent).await;
     node.shutdown().await;
     report
 }
