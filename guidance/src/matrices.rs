@@ -16,15 +16,10 @@ pub(crate) fn times_vector(a: &DMatrix<f64>, x: &DVector<f64>) -> DVector<f64> {
 
 /// Pseudo-inverse and rank, by singular values above 1e-12 of the largest.
 pub(crate) fn pseudo_inverse(a: &DMatrix<f64>) -> (DMatrix<f64>, usize) {
-    let scale = a.amax();
-    let none = || (DMatrix::zeros(a.ncols(), a.nrows()), 0);
-    if a.ncols() == 0 || scale == 0.0 {
-        return none();
-    }
-    let svd = (a / scale).svd(true, true);
-    let cut_off = 1e-12 * svd.singular_values.amax();
-    let rank = svd.rank(cut_off);
-    svd.pseudo_inverse(cut_off).map_or_else(|_| none(), |inverse| (inverse / scale, rank))
+    let rows = Rows::of(a);
+    let kept = rows.counted(RANK_CUT_OFF);
+    let identity = DMatrix::identity(a.nrows(), a.nrows());
+    (rows.least_answer(&kept, &identity), kept.len())
 }
 
 /// A' B, summed over the inner index in order.
@@ -85,81 +80,101 @@ pub(crate) fn solve_lower_right(right: &DMatrix<f64>, lower: &DMatrix<f64>) -> D
     x
 }
 
+/// Singular values below this share of the largest count as zero.
+const RANK_CUT_OFF: f64 = 1e-12;
+
 /// A = U R with U orthogonal (m x m) and the rows of R (m x n) orthogonal to each other: the
 /// singular value decomposition by one-sided rotations (Hestenes), for few rows and any number of
 /// columns. The lengths of R's rows are the singular values, in no order. Weak directions stay
 /// accurate beside strong ones, which a decomposition through a bidiagonal form does not promise.
-fn orthogonal_rows(a: &DMatrix<f64>) -> (DMatrix<f64>, DMatrix<f64>) {
-    let (m, n) = a.shape();
-    let (mut u, mut rows) = (DMatrix::identity(m, m), a.clone());
-    let dot = |rows: &DMatrix<f64>, p: usize, q: usize| -> f64 {
-        (0..n).map(|k| rows[(p, k)] * rows[(q, k)]).sum()
-    };
-    // As with Jacobi's rotations, a dozen sweeps have always been enough.
-    for _ in 0..60 {
-        let mut rotated = false;
-        for p in 0..m {
-            for q in p + 1..m {
-                let (pp, qq, pq) = (dot(&rows, p, p), dot(&rows, q, q), dot(&rows, p, q));
-                if pq.abs() <= 4.0 * f64::EPSILON * (pp * qq).sqrt() {
-                    continue;
+struct Rows {
+    u: DMatrix<f64>,
+    rows: DMatrix<f64>,
+}
+
+impl Rows {
+    fn of(a: &DMatrix<f64>) -> Self {
+        let m = a.nrows();
+        let mut this = Self { u: DMatrix::identity(m, m), rows: a.clone() };
+        // As with Jacobi's rotations, a dozen sweeps have always been enough.
+        for _ in 0..60 {
+            let mut rotated = false;
+            for p in 0..m {
+                for q in p + 1..m {
+                    rotated |= this.rotate(p, q);
                 }
-                rotated = true;
-                let theta = (qq - pp) / (2.0 * pq);
-                let t = theta.signum() / (theta.abs() + libm::hypot(theta, 1.0));
-                let c = 1.0 / libm::hypot(t, 1.0);
-                let s = t * c;
-                for k in 0..n {
-                    let (a, b) = (rows[(p, k)], rows[(q, k)]);
-                    rows[(p, k)] = c * a - s * b;
-                    rows[(q, k)] = s * a + c * b;
-                }
-                for k in 0..m {
-                    let (a, b) = (u[(k, p)], u[(k, q)]);
-                    u[(k, p)] = c * a - s * b;
-                    u[(k, q)] = s * a + c * b;
+            }
+            if !rotated {
+                break;
+            }
+        }
+        this
+    }
+
+    /// Makes rows p and q orthogonal unless they are; says whether it did.
+    fn rotate(&mut self, p: usize, q: usize) -> bool {
+        let (rows, u) = (&mut self.rows, &mut self.u);
+        let dot = |rows: &DMatrix<f64>, p: usize, q: usize| -> f64 {
+            (0..rows.ncols()).map(|k| rows[(p, k)] * rows[(q, k)]).sum()
+        };
+        let (pp, qq, pq) = (dot(rows, p, p), dot(rows, q, q), dot(rows, p, q));
+        if pq.abs() <= 4.0 * f64::EPSILON * (pp * qq).sqrt() {
+            return false;
+        }
+        let theta = (qq - pp) / (2.0 * pq);
+        let t = theta.signum() / (theta.abs() + libm::hypot(theta, 1.0));
+        let c = 1.0 / libm::hypot(t, 1.0);
+        let s = t * c;
+        for k in 0..rows.ncols() {
+            let (a, b) = (rows[(p, k)], rows[(q, k)]);
+            rows[(p, k)] = c * a - s * b;
+            rows[(q, k)] = s * a + c * b;
+        }
+        for k in 0..u.nrows() {
+            let (a, b) = (u[(k, p)], u[(k, q)]);
+            u[(k, p)] = c * a - s * b;
+            u[(k, q)] = s * a + c * b;
+        }
+        true
+    }
+
+    /// Which rows of R count, with their lengths: singular values above `cut_off` of the largest.
+    fn counted(&self, cut_off: f64) -> Vec<(usize, f64)> {
+        let length = |row: usize| self.rows.row(row).iter().map(|x| x * x).sum::<f64>().sqrt();
+        let lengths: Vec<f64> = (0..self.rows.nrows()).map(length).collect();
+        let largest = lengths.iter().fold(0.0, |a: f64, &b| a.max(b));
+        let kept = lengths.into_iter().enumerate().filter(|&(_, l)| l > cut_off * largest);
+        kept.collect()
+    }
+
+    /// The X of least size for which A X is nearest to B, by the rows that count.
+    fn least_answer(&self, kept: &[(usize, f64)], b: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut answer = DMatrix::zeros(self.rows.ncols(), b.ncols());
+        for &(row, length) in kept {
+            for column in 0..b.ncols() {
+                let along: f64 = (0..b.nrows()).map(|k| self.u[(k, row)] * b[(k, column)]).sum();
+                let size = along / length / length;
+                for k in 0..answer.nrows() {
+                    answer[(k, column)] += self.rows[(row, k)] * size;
                 }
             }
         }
-        if !rotated {
-            break;
-        }
+        answer
     }
-    (u, rows)
-}
-
-/// Which rows of R count: singular values above `cut_off` of the largest.
-fn counted_rows(rows: &DMatrix<f64>, cut_off: f64) -> Vec<(usize, f64)> {
-    let lengths: Vec<f64> =
-        rows.row_iter().map(|row| row.iter().map(|x| x * x).sum::<f64>().sqrt()).collect();
-    let largest = lengths.iter().fold(0.0, |a: f64, &b| a.max(b));
-    let kept = lengths.into_iter().enumerate().filter(|&(_, l)| l > cut_off * largest);
-    kept.collect()
 }
 
 /// Orthonormal columns that span the range of A (few rows): left singular vectors whose singular
 /// values exceed `cut_off` of the largest.
 pub(crate) fn range(a: &DMatrix<f64>, cut_off: f64) -> DMatrix<f64> {
-    let (u, rows) = orthogonal_rows(a);
-    let kept: Vec<usize> = counted_rows(&rows, cut_off).into_iter().map(|(row, _)| row).collect();
-    u.select_columns(&kept)
+    let rows = Rows::of(a);
+    let kept: Vec<usize> = rows.counted(cut_off).into_iter().map(|(row, _)| row).collect();
+    rows.u.select_columns(&kept)
 }
 
-/// The X of least size for which A X is nearest to B, A with few rows: pseudo-inverse times B, by
-/// singular values above 1e-12 of the largest.
+/// The X of least size for which A X is nearest to B, A with few rows.
 pub(crate) fn least_answer(a: &DMatrix<f64>, b: &DMatrix<f64>) -> DMatrix<f64> {
-    let (u, rows) = orthogonal_rows(a);
-    let mut answer = DMatrix::zeros(a.ncols(), b.ncols());
-    for (row, length) in counted_rows(&rows, 1e-12) {
-        for column in 0..b.ncols() {
-            let along: f64 = (0..a.nrows()).map(|k| u[(k, row)] * b[(k, column)]).sum();
-            let size = along / (length * length);
-            for k in 0..a.ncols() {
-                answer[(k, column)] += rows[(row, k)] * size;
-            }
-        }
-    }
-    answer
+    let rows = Rows::of(a);
+    rows.least_answer(&rows.counted(RANK_CUT_OFF), b)
 }
 
 /// Eigenvalues of a small symmetric matrix, least first: Jacobi's rotations in cyclic order, which

@@ -145,7 +145,8 @@ impl Service {
         let work = move |budget: Budget<'_>| -> Result<(PlanVerdict, Option<Loaded>), Error> {
             let verdict = artifact.plan(initial.as_ref(), budget);
             let verdict = verdict.map_err(|fault| Error::step("initial", fault))?;
-            let kept = artifact.is_plan().then(|| keep_plan(&*store, artifact));
+            let sound = verdict.certificate().is_none_or(|certificate| certificate.passed);
+            let kept = (sound && artifact.is_plan()).then(|| keep_plan(&*store, artifact));
             Ok((verdict, kept.transpose()?))
         };
         let timed = self.compute.run("plan", call.deadline, work).await?;
