@@ -155,7 +155,10 @@ async fn malformed_plan_states_and_limits_are_named() {
 #[tokio::test(flavor = "multi_thread")]
 async fn malformed_plan_instants_are_named() {
     let server = server().await;
-    let equal = |count: i32, duration: Value| json!({ "equalTime": { "count": count, "durationS": duration } });
+    let equal = |count: i32, duration: Value| {
+        let spacing = json!({ "count": count, "durationS": duration });
+        json!({ "equalTime": spacing })
+    };
     for (value, field) in [
         (json!({}), "instants"),
         (equal(1, json!(18000.0)), "instants.equal_time.count"),
