@@ -196,10 +196,10 @@ pub(crate) async fn fly(
     plan: &Plan,
     run: u32,
 ) -> Result<(Flight, VariableHorizonArtifact), SimulationError> {
-    let mut starts = stream_of_chance(plan.seed, run, 0);
+    let mut starts = Starts::of(plan, run);
     let mut reason = String::new();
     for redraws in 0..STARTS_MAX {
-        let candidate = draw(client, plan, run, &mut starts).await?;
+        let candidate = starts.draw(client, plan).await?;
         let (prepared, start) = match candidate {
             Candidate::Start(prepared, start) => (prepared, start),
             Candidate::Refused(why) => {
@@ -225,29 +225,57 @@ pub(crate) enum Candidate {
     Refused(String),
 }
 
-/// Draws parameters and start of a run, and has the service prepare for them.
-pub(crate) async fn draw(
-    client: &Client,
-    plan: &Plan,
+/// The starts of one run, one after the other until one can be flown.
+pub(crate) struct Starts {
     run: u32,
-    starts: &mut ChaCha12Rng,
-) -> Result<Candidate, SimulationError> {
-    let mut problem = plan.mission.problem.clone();
-    if let Some(randomised) = &plan.mission.simulation.randomised {
-        randomised.apply(&mut problem, starts);
+    chance: ChaCha12Rng,
+    /// The problem with the parameters last drawn, and how many more starts are drawn with them.
+    problem: Option<(v1::Problem, u32)>,
+}
+
+impl Starts {
+    pub(crate) fn of(plan: &Plan, run: u32) -> Self {
+        Self { run, chance: stream_of_chance(plan.seed, run, 0), problem: None }
     }
-    let prepared = match prepare(client, run, problem).await? {
-        Ok(prepared) => prepared,
-        Err(reason) if plan.start_is_random() => return Ok(Candidate::Refused(reason)),
-        Err(reason) => return Err(SimulationError::NoStart { run, tries: 1, reason }),
-    };
-    let limit = prepared.sets.generators_of_limit();
-    let law = &plan.mission.simulation.initial_state;
-    let drawn = law.draw(&prepared.model, &|state| contains_in_plane(&limit, state), starts);
-    Ok(match drawn {
-        Some(start) => Candidate::Start(Box::new(prepared), start),
-        None => Candidate::Refused("the law of the initial state rejects every draw".into()),
-    })
+
+    /// Draws parameters, unless the last are good for another start, and a start, and has the
+    /// service prepare for them.
+    pub(crate) async fn draw(
+        &mut self,
+        client: &Client,
+        plan: &Plan,
+    ) -> Result<Candidate, SimulationError> {
+        let run = self.run;
+        let problem = self.parameters(plan);
+        let prepared = match prepare(client, run, problem).await? {
+            Ok(prepared) => prepared,
+            Err(reason) if plan.start_is_random() => return Ok(Candidate::Refused(reason)),
+            Err(reason) => return Err(SimulationError::NoStart { run, tries: 1, reason }),
+        };
+        let limit = prepared.sets.generators_of_limit();
+        let inside = |state: &_| contains_in_plane(&limit, state);
+        let law = &plan.mission.simulation.initial_state;
+        Ok(match law.draw(&prepared.model, &inside, &mut self.chance) {
+            Some(start) => Candidate::Start(Box::new(prepared), start),
+            None => Candidate::Refused("the law of the initial state rejects every draw".into()),
+        })
+    }
+
+    fn parameters(&mut self, plan: &Plan) -> v1::Problem {
+        let Some(randomised) = &plan.mission.simulation.randomised else {
+            return plan.mission.problem.clone();
+        };
+        if let Some((problem, left)) = &mut self.problem
+            && *left > 0
+        {
+            *left -= 1;
+            return problem.clone();
+        }
+        let mut problem = plan.mission.problem.clone();
+        randomised.apply(&mut problem, &mut self.chance);
+        self.problem = Some((problem.clone(), randomised.starts_per_draw.get() - 1));
+        problem
+    }
 }
 
 impl Plan {

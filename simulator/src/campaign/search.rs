@@ -11,7 +11,7 @@ use vbar_proto::v1::HorizonSearch;
 
 use super::{
     Plan, SimulationError,
-    flight::{Candidate, Decision, STARTS_MAX, Session, draw, stream_of_chance},
+    flight::{Candidate, Decision, STARTS_MAX, Session, Starts, stream_of_chance},
     vehicle::Vehicle,
     with_search,
 };
@@ -76,10 +76,10 @@ pub(crate) async fn compare(
     };
     let (local, enumeration) = (under(HorizonSearch::Local), under(HorizonSearch::Enumeration));
     // Both draw from the same stream, so the starts are equal.
-    let mut chance = [stream_of_chance(plan.seed, run, 0), stream_of_chance(plan.seed, run, 0)];
+    let mut starts = [Starts::of(plan, run), Starts::of(plan, run)];
     for _ in 0..STARTS_MAX {
-        let first = draw(client, &local, run, &mut chance[0]).await?;
-        let second = draw(client, &enumeration, run, &mut chance[1]).await?;
+        let first = starts[0].draw(client, &local).await?;
+        let second = starts[1].draw(client, &enumeration).await?;
         let (Candidate::Start(ours, start), Candidate::Start(theirs, _)) = (first, second) else {
             continue;
         };

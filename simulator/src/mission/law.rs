@@ -3,6 +3,8 @@
 //! Every draw takes its stream of chance as an argument, so a run depends on the seed and its own
 //! number alone.
 
+use std::num::NonZeroU32;
+
 use nalgebra::{DVector, Vector3, Vector6};
 use rand::{Rng, RngExt as _};
 use serde::Deserialize;
@@ -340,6 +342,14 @@ pub(crate) struct Randomisation {
     pub acceleration_max_m_s2: Option<[f64; 2]>,
     /// Least and greatest spin period, uniform between; the axis is that of the problem's spin.
     pub spin_period_s: Option<[f64; 2]>,
+    /// Starts drawn with the same parameters before these are drawn again: what is refused for
+    /// weak parameters would otherwise leave few of them among the runs.
+    #[serde(default = "one_start")]
+    pub starts_per_draw: NonZeroU32,
+}
+
+fn one_start() -> NonZeroU32 {
+    NonZeroU32::MIN
 }
 
 impl Randomisation {
