@@ -1,10 +1,14 @@
 //! Convex sets that speak by their support function.
 
+mod centred_ellipsoid;
 mod polytope;
 mod zonotope;
+mod zonotope_facets;
 
+pub use centred_ellipsoid::{CentredEllipsoid, Tangent};
 pub use polytope::Polytope;
 pub use zonotope::{Zonotope, ZonotopeGauge, ZonotopeMeasure};
+pub use zonotope_facets::ZonotopeFacets;
 
 use nalgebra::DVector;
 
