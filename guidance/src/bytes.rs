@@ -44,6 +44,10 @@ impl Writer {
         self.bytes.extend((count as u64).to_le_bytes());
     }
 
+    pub(crate) fn integer(&mut self, value: i64) {
+        self.bytes.extend(value.to_le_bytes());
+    }
+
     /// Counts of two bytes each, for indices that travel often; larger ones are saturated, and
     /// readers check what indices they get.
     pub(crate) fn small_counts(&mut self, counts: &[usize]) {
@@ -125,6 +129,12 @@ impl<'a> Reader<'a> {
             .ok()
             .filter(|&count| count <= COUNT_MAX)
             .ok_or_else(|| self.fault("count too large"))
+    }
+
+    pub(crate) fn integer(&mut self) -> Result<i64, DecodeError> {
+        let mut raw = [0; 8];
+        raw.copy_from_slice(self.take(8)?);
+        Ok(i64::from_le_bytes(raw))
     }
 
     pub(crate) fn small_counts(&mut self) -> Result<Vec<usize>, DecodeError> {

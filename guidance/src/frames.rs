@@ -23,10 +23,27 @@ pub struct Rtn;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LvlhCcsds;
 
+/// Axes that do not rotate, centred on the Earth; [`InertialAxes`] names which.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Inertial;
+
 impl sealed::Sealed for Rtn {}
 impl sealed::Sealed for LvlhCcsds {}
+impl sealed::Sealed for Inertial {}
 impl Frame for Rtn {}
 impl Frame for LvlhCcsds {}
+impl Frame for Inertial {}
+
+/// Which inertial axes are meant: a label, carried and compared but not converted here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum InertialAxes {
+    /// Mean equator and equinox of J2000.
+    Eme2000,
+    /// True equator, mean equinox of date: the axes of two-line elements.
+    Teme,
+    /// Geocentric celestial reference frame.
+    Gcrf,
+}
 
 /// A rotation matrix that takes components in `From` to components in `To`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,6 +60,11 @@ pub const RTN_FROM_LVLH_CCSDS: Rotation<Rtn, LvlhCcsds> = Rotation {
 };
 
 impl<To: Frame, From: Frame> Rotation<To, From> {
+    /// From its matrix, which must be orthonormal with determinant 1.
+    pub(crate) fn from_matrix(matrix: Matrix3<f64>) -> Self {
+        Self { matrix, frames: PhantomData }
+    }
+
     /// The rotation the other way.
     #[must_use]
     pub fn inverse(&self) -> Rotation<From, To> {

@@ -12,8 +12,8 @@
 //! | 4 | [`control`]: one folder a method |
 //! | 3 | [`mission`], [`reach`] |
 //! | 2 | [`dynamics`] |
-//! | 1 | [`sets`], [`program`] |
-//! | 0 | [`units`], [`frames`], [`budget`], [`bytes`], `matrices` |
+//! | 1 | [`sets`], [`program`], [`orbit`] |
+//! | 0 | [`units`], [`frames`], [`epoch`], [`budget`], [`bytes`], `matrices` |
 //!
 //! References, cited by key throughout:
 //!
@@ -24,14 +24,23 @@
 //!   doi 10.2514/1.G008874.
 //! - **\[Quartullo2025b\]** Quartullo, Bianchini, Garulli, Giannitrapani, "Robust Variable-Horizon
 //!   MPC with Adaptive Terminal Constraints", Automatica 179, 2025, 112465.
+//! - **\[Deaconu2014\]** Deaconu, Louembet, Théron, "Minimizing the Effects of Navigation
+//!   Uncertainties on the Spacecraft Rendezvous Precision", JGCD 37(2), 2014, pp. 695-700,
+//!   doi 10.2514/1.62219.
+//! - **\[YamanakaAnkersen2002\]** Yamanaka, Ankersen, "New State Transition Matrix for Relative
+//!   Motion on an Arbitrary Elliptical Orbit", JGCD 25(1), 2002, pp. 60-66.
+//! - **\[Ros2002\]** Ros, Sabater, Thomas, "An Ellipsoidal Calculus Based on Propagation and
+//!   Fusion", IEEE Transactions on Systems, Man, and Cybernetics B 32(4), 2002, pp. 430-442.
 
 pub mod budget;
 pub mod bytes;
 pub mod control;
 pub mod dynamics;
+pub mod epoch;
 pub mod frames;
 mod matrices;
 pub mod mission;
+pub mod orbit;
 pub mod program;
 pub mod reach;
 pub mod sets;

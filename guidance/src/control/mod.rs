@@ -1,5 +1,6 @@
 //! The methods: one folder each, one trait, one list.
 
+pub mod disturbance_feedback;
 pub mod variable_horizon;
 mod verdict;
 
@@ -14,17 +15,20 @@ use crate::budget::{Budget, Interruption};
 pub enum Method {
     /// Variable-horizon tube MPC and its baselines.
     VariableHorizon,
+    /// Fixed-time rendezvous plans with disturbance feedback.
+    DisturbanceFeedback,
 }
 
 impl Method {
     /// Every method.
-    pub const ALL: [Self; 1] = [Self::VariableHorizon];
+    pub const ALL: [Self; 2] = [Self::VariableHorizon, Self::DisturbanceFeedback];
 
     /// Name on the wire and in identifiers.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::VariableHorizon => "variable_horizon",
+            Self::DisturbanceFeedback => "disturbance_feedback",
         }
     }
 
@@ -33,6 +37,7 @@ impl Method {
     pub const fn version(self) -> &'static str {
         match self {
             Self::VariableHorizon => variable_horizon::VERSION,
+            Self::DisturbanceFeedback => disturbance_feedback::VERSION,
         }
     }
 }

@@ -1,0 +1,215 @@
+//! Canonical bytes of a problem: equal problems, equal bytes; also how plans keep them.
+
+use super::{ArrivalMetric, Instants, Problem};
+use crate::{
+    bytes::{DecodeError, Reader, Writer},
+    epoch::{Epoch, TimeSystem},
+    frames::{InFrame, InertialAxes, LvlhCcsds, RelativeState},
+    orbit::{KeplerOrbit, Orientation},
+    sets::{Ellipsoid, OuterSum},
+    units::{Angle, Distance, Seconds},
+};
+
+impl Problem {
+    /// Canonical bytes of the parsed values; their digest names the problem.
+    #[must_use]
+    pub fn canonical_bytes(&self) -> Vec<u8> {
+        let mut writer = Writer::default();
+        write_problem(&mut writer, self);
+        writer.finish()
+    }
+
+    /// Reads what [`Problem::canonical_bytes`] wrote.
+    ///
+    /// # Errors
+    /// [`DecodeError`] for anything else, and for a problem with faults.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, DecodeError> {
+        let mut reader = Reader::new(bytes);
+        let problem = read_problem(&mut reader)?;
+        reader.end()?;
+        Ok(problem)
+    }
+}
+
+pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
+    write_orbit(writer, &problem.orbit);
+    writer.option(problem.epoch, write_epoch);
+    write_state(writer, &problem.initial);
+    write_state(writer, &problem.target_state);
+    write_instants(writer, &problem.instants);
+    writer.number(problem.delta_v_max_m_s);
+    writer.count(problem.navigation_errors.len());
+    problem.navigation_errors.iter().for_each(|set| writer.matrix(set.shape()));
+    writer.tag(match problem.outer_sum {
+        OuterSum::MinVolume => 1,
+        OuterSum::MinTrace => 2,
+    });
+    writer.tag(match problem.metric {
+        ArrivalMetric::Position => 1,
+        ArrivalMetric::Scaled6 => 2,
+        ArrivalMetric::Physical6 => 3,
+    });
+    writer.number(problem.fuel_weight);
+    writer.number(problem.effort_weight);
+    writer.tag(u8::from(problem.compare_open_loop));
+}
+
+pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeError> {
+    let orbit = read_orbit(reader)?;
+    let epoch = reader.option(read_epoch)?;
+    let initial = read_state(reader)?;
+    let target_state = read_state(reader)?;
+    let instants = read_instants(reader)?;
+    let delta_v_max_m_s = reader.number()?;
+    let sets = reader.count()?;
+    let navigation_errors = (0..sets)
+        .map(|_| {
+            let shape = reader.matrix()?;
+            Ellipsoid::from_shape(shape).map_err(|fault| reader.fault(fault.to_string()))
+        })
+        .collect::<Result<_, _>>()?;
+    let outer_sum = match reader.tag()? {
+        1 => OuterSum::MinVolume,
+        2 => OuterSum::MinTrace,
+        other => return Err(unknown(reader, "outer sum", other)),
+    };
+    let metric = match reader.tag()? {
+        1 => ArrivalMetric::Position,
+        2 => ArrivalMetric::Scaled6,
+        3 => ArrivalMetric::Physical6,
+        other => return Err(unknown(reader, "metric", other)),
+    };
+    let (fuel_weight, effort_weight) = (reader.number()?, reader.number()?);
+    let compare_open_loop = match reader.tag()? {
+        0 => false,
+        1 => true,
+        other => return Err(unknown(reader, "comparison", other)),
+    };
+    let problem = Problem {
+        orbit,
+        epoch,
+        initial,
+        target_state,
+        instants,
+        delta_v_max_m_s,
+        navigation_errors,
+        outer_sum,
+        metric,
+        fuel_weight,
+        effort_weight,
+        compare_open_loop,
+    };
+    match problem.faults().first() {
+        None => Ok(problem),
+        Some(fault) => Err(reader.fault(format!("{}: {}", fault.field, fault.got))),
+    }
+}
+
+fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
+    reader.fault(format!("{what} {tag} is not known"))
+}
+
+fn write_orbit(writer: &mut Writer, orbit: &KeplerOrbit) {
+    writer.number(orbit.semi_major_axis().metres());
+    writer.number(orbit.eccentricity());
+    writer.number(orbit.true_anomaly().radians());
+    writer.option(orbit.orientation(), |writer, orientation| {
+        writer.number(orientation.inclination.radians());
+        writer.number(orientation.raan.radians());
+        writer.number(orientation.argument_of_perigee.radians());
+        writer.tag(match orientation.axes {
+            InertialAxes::Eme2000 => 1,
+            InertialAxes::Teme => 2,
+            InertialAxes::Gcrf => 3,
+        });
+    });
+}
+
+fn read_orbit(reader: &mut Reader<'_>) -> Result<KeplerOrbit, DecodeError> {
+    let semi_major_axis = Distance::from_metres(reader.number()?);
+    let eccentricity = reader.number()?;
+    let true_anomaly = Angle::from_radians(reader.number()?);
+    let orientation = reader.option(|reader| {
+        let mut angle = || reader.number().map(Angle::from_radians);
+        let (inclination, raan, argument_of_perigee) = (angle()?, angle()?, angle()?);
+        let axes = match reader.tag()? {
+            1 => InertialAxes::Eme2000,
+            2 => InertialAxes::Teme,
+            3 => InertialAxes::Gcrf,
+            other => return Err(unknown(reader, "inertial axes", other)),
+        };
+        Ok(Orientation { inclination, raan, argument_of_perigee, axes })
+    })?;
+    KeplerOrbit::new(semi_major_axis, eccentricity, true_anomaly, orientation)
+        .map_err(|fault| reader.fault(fault.to_string()))
+}
+
+fn write_epoch(writer: &mut Writer, epoch: Epoch) {
+    writer.integer(epoch.nanoseconds_since_j2000_tai);
+    writer.tag(match epoch.time_system {
+        TimeSystem::Utc => 1,
+        TimeSystem::Tai => 2,
+        TimeSystem::Tt => 3,
+        TimeSystem::Gps => 4,
+        TimeSystem::Tdb => 5,
+    });
+}
+
+fn read_epoch(reader: &mut Reader<'_>) -> Result<Epoch, DecodeError> {
+    let nanoseconds_since_j2000_tai = reader.integer()?;
+    let time_system = match reader.tag()? {
+        1 => TimeSystem::Utc,
+        2 => TimeSystem::Tai,
+        3 => TimeSystem::Tt,
+        4 => TimeSystem::Gps,
+        5 => TimeSystem::Tdb,
+        other => return Err(unknown(reader, "time system", other)),
+    };
+    Ok(Epoch { nanoseconds_since_j2000_tai, time_system })
+}
+
+fn write_state(writer: &mut Writer, state: &RelativeState<LvlhCcsds>) {
+    writer.vector3(&state.position_m.components);
+    writer.vector3(&state.velocity_m_s.components);
+}
+
+fn read_state(reader: &mut Reader<'_>) -> Result<RelativeState<LvlhCcsds>, DecodeError> {
+    let mut vector = || reader.vector3().map(InFrame::<LvlhCcsds>::new);
+    Ok(RelativeState { position_m: vector()?, velocity_m_s: vector()? })
+}
+
+fn write_instants(writer: &mut Writer, instants: &Instants) {
+    match instants {
+        Instants::EqualTime { count, duration } => {
+            writer.tag(1);
+            writer.count(*count);
+            writer.number(duration.seconds());
+        }
+        Instants::EqualTrueAnomaly { count, duration } => {
+            writer.tag(2);
+            writer.count(*count);
+            writer.number(duration.seconds());
+        }
+        Instants::Given(times) => {
+            writer.tag(3);
+            let times: Vec<f64> = times.iter().map(|t| t.seconds()).collect();
+            writer.numbers(&times);
+        }
+    }
+}
+
+fn read_instants(reader: &mut Reader<'_>) -> Result<Instants, DecodeError> {
+    let tag = reader.tag()?;
+    let mut equal = || -> Result<(usize, Seconds), DecodeError> {
+        Ok((reader.count()?, Seconds::from_seconds(reader.number()?)))
+    };
+    match tag {
+        1 => equal().map(|(count, duration)| Instants::EqualTime { count, duration }),
+        2 => equal().map(|(count, duration)| Instants::EqualTrueAnomaly { count, duration }),
+        3 => {
+            let times = reader.numbers()?;
+            Ok(Instants::Given(times.into_iter().map(Seconds::from_seconds).collect()))
+        }
+        other => Err(unknown(reader, "instants", other)),
+    }
+}
