@@ -2,6 +2,7 @@
 //! ([`Solution`]), and whether it is true ([`verify`], which trusts no solver).
 
 mod clarabel;
+mod common_margin;
 mod dual_simplex;
 mod gauge;
 mod projection;
@@ -9,6 +10,7 @@ mod tables;
 mod verify;
 
 pub use clarabel::{Clarabel, RelaxedFamily, least_relaxation};
+pub use common_margin::{CommonMargin, MarginAnswer};
 pub use dual_simplex::DualSimplex;
 pub use gauge::zonotope_gauge;
 pub use projection::project_onto_polytope;
