@@ -1,11 +1,14 @@
 //! Optimisation programs: what is asked ([`HorizonProgram`]), how ([`Solver`]), what came of it
-//! ([`Solution`]), and whether it is true ([`verify`], which trusts no solver).
+//! ([`Solution`]), and whether it is true ([`verify`], which trusts no solver). Dense quadratic
+//! programs with very many rows have words of their own ([`QuadraticProgram`], [`DualActiveSet`],
+//! [`verify_quadratic`]).
 
 mod clarabel;
 mod common_margin;
 mod dual_simplex;
 mod gauge;
 mod projection;
+mod quadratic;
 mod tables;
 mod verify;
 
@@ -14,6 +17,10 @@ pub use common_margin::{CommonMargin, MarginAnswer};
 pub use dual_simplex::DualSimplex;
 pub use gauge::zonotope_gauge;
 pub use projection::project_onto_polytope;
+pub use quadratic::{
+    ActiveRow, DenseRows, DualActiveSet, InfeasibilityProof, NotPositiveDefinite, QuadraticCost,
+    QuadraticProgram, QuadraticResiduals, QuadraticSolution, prove_infeasible, verify_quadratic,
+};
 pub use tables::PlantTables;
 pub use verify::{DualBound, Residual, Residuals, dual_bound, farkas_margin, simulate, verify};
 
