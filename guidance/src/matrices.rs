@@ -127,3 +127,11 @@ pub(crate) fn product_fixed<const R: usize, const I: usize, const C: usize>(
 ) -> SMatrix<f64, R, C> {
     SMatrix::from_fn(|i, j| (0..I).map(|k| a[(i, k)] * b[(k, j)]).sum())
 }
+
+/// A' B for matrices whose shapes are known, summed over the inner index in order.
+pub(crate) fn transposed_fixed_product<const R: usize, const I: usize, const C: usize>(
+    a: &SMatrix<f64, I, R>,
+    b: &SMatrix<f64, I, C>,
+) -> SMatrix<f64, R, C> {
+    SMatrix::from_fn(|i, j| (0..I).map(|k| a[(k, i)] * b[(k, j)]).sum())
+}

@@ -155,9 +155,8 @@ impl<'a> Simplex<'a> {
     fn new(program: &'a CommonMargin) -> Self {
         let (n, r) = (program.variables, program.len());
         // At z = 0 the margin of row i is -b_i.
-        let tightest = (0..r)
-            .max_by(|&i, &j| program.offsets[i].total_cmp(&program.offsets[j]))
-            .unwrap_or(0);
+        let tightest =
+            (0..r).max_by(|&i, &j| program.offsets[i].total_cmp(&program.offsets[j])).unwrap_or(0);
         let mut basis: Vec<usize> = (0..r).map(|i| n + 1 + i).collect();
         basis[tightest] = n;
         let mut is_basic = vec![false; n + 1 + r];
@@ -326,8 +325,7 @@ impl<'a> Simplex<'a> {
         let r = self.rows();
         // The column was made for the signed variable.
         let pivot = column[row] * sign;
-        let scaled: Vec<f64> =
-            self.inverse[row * r..][..r].iter().map(|x| x / pivot).collect();
+        let scaled: Vec<f64> = self.inverse[row * r..][..r].iter().map(|x| x / pivot).collect();
         for k in 0..r {
             let factor = column[k] * sign;
             if k != row && factor != 0.0 {

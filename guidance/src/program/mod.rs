@@ -9,6 +9,8 @@ mod dual_simplex;
 mod gauge;
 mod projection;
 mod quadratic;
+mod regulator;
+mod separation;
 mod tables;
 mod verify;
 
@@ -20,6 +22,11 @@ pub use projection::project_onto_polytope;
 pub use quadratic::{
     ActiveRow, DenseRows, DualActiveSet, InfeasibilityProof, NotPositiveDefinite, QuadraticCost,
     QuadraticProgram, QuadraticResiduals, QuadraticSolution, prove_infeasible, verify_quadratic,
+};
+pub use regulator::{CondensedRegulator, RegulatorAnswer, RegulatorProgram, Softness, StateCut};
+pub use separation::{
+    HalfSpaces, Separation, SeparationOutcome, nearest_point_of_polytope, polytope_is_empty,
+    separate_from_ellipsoids, separate_from_polytopes,
 };
 pub use tables::PlantTables;
 pub use verify::{DualBound, Residual, Residuals, dual_bound, farkas_margin, simulate, verify};
