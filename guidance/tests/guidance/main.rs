@@ -3,5 +3,7 @@
 #![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
 
 mod golden;
+mod golden_abort_safe;
 mod laws;
 mod quadratic;
+mod two_body_truth;
