@@ -78,8 +78,7 @@ pub fn elliptic_step(
 ) -> HeldStep {
     let (from, length) = (start.seconds(), duration.seconds());
     let perigee = orbit.semi_major_axis().metres() * (1.0 - orbit.eccentricity());
-    let fastest =
-        libm::sqrt(EARTH_MU_M3_S2 * orbit.semi_latus_rectum_m()) / (perigee * perigee);
+    let fastest = libm::sqrt(EARTH_MU_M3_S2 * orbit.semi_latus_rectum_m()) / (perigee * perigee);
     let count = libm::ceil(fastest * length / TURN_MAX_RAD).clamp(1.0, INTEGRATION_STEPS_MAX);
     let step = length / count;
     let at = |t: f64| rates(orbit, orbit.true_anomaly_after(Seconds::from_seconds(t)).radians());
@@ -207,7 +206,10 @@ impl HeldStep {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{dynamics::clohessy_wiltshire, units::{Angle, Distance}};
+    use crate::{
+        dynamics::clohessy_wiltshire,
+        units::{Angle, Distance},
+    };
 
     fn orbit(e: f64, degrees: f64) -> KeplerOrbit {
         let axis = Distance::from_metres(7_419_320.0);

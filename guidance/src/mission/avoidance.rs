@@ -105,7 +105,9 @@ impl AvoidanceSet {
     pub fn outer_polytope(&self) -> Polytope {
         let (normals, offsets) = match &self.region {
             AvoidanceRegion::Faces { normals, offsets } => (normals.clone(), offsets.clone()),
-            AvoidanceRegion::HalfWidths(widths) | AvoidanceRegion::SemiAxes(widths) => box_of(widths),
+            AvoidanceRegion::HalfWidths(widths) | AvoidanceRegion::SemiAxes(widths) => {
+                box_of(widths)
+            }
             AvoidanceRegion::Radius(radius) => box_of(&Vector3::repeat(*radius)),
             AvoidanceRegion::ShapeMatrix(shape) => {
                 box_of(&Vector3::new(shape[(0, 0)], shape[(1, 1)], shape[(2, 2)]).map(f64::sqrt))

@@ -71,7 +71,10 @@ impl Thrusters {
     pub fn cube_corners(force_max: Force) -> Option<Self> {
         let sign = |bits: usize, bit: usize| if bits >> bit & 1 == 0 { 1.0 } else { -1.0 };
         let corner = |i| Vector3::new(sign(i, 2), sign(i, 1), sign(i, 0));
-        (0..8).map(|i| Thruster::new(corner(i), force_max)).collect::<Option<_>>().and_then(Self::new)
+        (0..8)
+            .map(|i| Thruster::new(corner(i), force_max))
+            .collect::<Option<_>>()
+            .and_then(Self::new)
     }
 
     /// The thrusters, from 0.
@@ -121,10 +124,7 @@ impl ThrustMode {
 
     /// The given thrusters, from 0, work; indices beyond 31 are not representable and give `None`.
     pub fn of(working: impl IntoIterator<Item = usize>) -> Option<Self> {
-        working
-            .into_iter()
-            .try_fold(0, |bits, j| (j < 32).then(|| bits | 1 << j))
-            .map(Self)
+        working.into_iter().try_fold(0, |bits, j| (j < 32).then(|| bits | 1 << j)).map(Self)
     }
 
     /// The bits.

@@ -85,8 +85,7 @@ impl CentredEllipsoid {
             terms.map(|(w, x)| w * (x / (1.0 + t * w)) * (x / (1.0 + t * w))).sum::<f64>() - 1.0
         };
         // At this t the sum is below sum w x^2 / (t w)^2 = 1.
-        let mut high =
-            weights.iter().zip(x.iter()).map(|(w, x)| x * x / w).sum::<f64>().sqrt();
+        let mut high = weights.iter().zip(x.iter()).map(|(w, x)| x * x / w).sum::<f64>().sqrt();
         let mut low = 0.0;
         // Convex and decreasing: Newton from the left never passes the root.
         for _ in 0..500 {
