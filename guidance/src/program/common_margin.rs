@@ -252,7 +252,7 @@ impl<'a> Simplex<'a> {
         self.values[row] = if downwards { 1.0 - step } else { step };
         self.replace(row, &column, sign);
         self.pivots += 1;
-        if self.pivots % REFACTOR_AFTER == 0 {
+        if self.pivots.is_multiple_of(REFACTOR_AFTER) {
             self.refactor();
         }
         true

@@ -4,8 +4,8 @@
 use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, SVector, Vector3};
 
 use super::{
-    Clarabel, DenseRows, DualActiveSet, NotPositiveDefinite, QuadraticCost, QuadraticProgram,
-    QuadraticSolution, Status,
+    ActiveRow, Clarabel, DenseRows, DualActiveSet, NotPositiveDefinite, QuadraticCost,
+    QuadraticProgram, QuadraticSolution, Status,
 };
 use crate::{
     budget::{Budget, Interruption},
@@ -94,8 +94,8 @@ pub struct RegulatorAnswer {
     pub objective: f64,
     /// max(0, offset - normal x) of each cut.
     pub violations: Vec<f64>,
-    /// Rows that hold with equality, for the next start.
-    pub active: Vec<usize>,
+    /// Rows that hold with equality, or those of the proof that there is no answer.
+    pub active: Vec<ActiveRow>,
     /// Rows that entered or left.
     pub iterations: usize,
     /// The dual active set did not do it and the general solver did.
@@ -295,7 +295,7 @@ impl RegulatorProgram<'_> {
             states: Vec::new(),
             objective: f64::INFINITY,
             violations: Vec::new(),
-            active: solution.active_rows(),
+            active: solution.active.clone(),
             iterations: solution.iterations,
             by_general_solver,
         };
