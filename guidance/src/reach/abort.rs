@@ -3,7 +3,7 @@
 
 use nalgebra::{SMatrix, Vector3};
 
-use super::flight::Flight;
+use super::flight::{Closest, Flight};
 use crate::{
     budget::{Budget, Interruption},
     dynamics::{PeriodicPlant, RelativeVector},
@@ -68,6 +68,9 @@ pub struct Abort {
     pub flight: Flight,
     /// Least over the instants of the largest excess over a face, in parts of that face's offset.
     pub margin: f64,
+    /// The closest moment to the target's centre of mass, between instants too; `least` is in
+    /// square metres. Infinitely far for a flight without states.
+    pub closest: Closest,
     /// Linear programs solved.
     pub programs: usize,
 }
@@ -308,6 +311,8 @@ impl<'a> Search<'a> {
             }
         }
         let margin = flight.states().iter().map(|x| self.excess(x)).fold(f64::INFINITY, f64::min);
-        Abort { throttles: all, forces_n: self.forces(throttles), flight, margin, programs }
+        let closest = flight.closest_to_target();
+        let forces_n = self.forces(throttles);
+        Abort { throttles: all, forces_n, flight, margin, closest, programs }
     }
 }

@@ -81,11 +81,18 @@ impl Flight {
         self.spacing_s
     }
 
+    /// The closest moment to the target's centre of mass; `least` is in square metres, infinite
+    /// for a flight without states.
+    #[must_use]
+    pub fn closest_to_target(&self) -> Closest {
+        let never = Closest { least: f64::INFINITY, at_s: 0.0 };
+        self.closest(&Matrix3::identity()).unwrap_or(never)
+    }
+
     /// The least p'Wp over the whole flight, W (3 x 3) positive definite.
     ///
-    /// Between samples the position is the cubic through their positions and velocities, whose
-    /// error is of the fourth order in the spacing: below 1e-3 of what a mean motion n does in a
-    /// sample, (n dt)^4 / 384 of the distance, 2e-9 for 30 s in low orbit.
+    /// Between samples the position is the cubic through their positions and velocities. Its error
+    /// is about (n dt)^4 / 384 of the distance for a mean motion n: 4e-9 for 30 s in low orbit.
     #[must_use]
     pub fn closest(&self, weight: &Matrix3<f64>) -> Option<Closest> {
         let form = |p: &Vector3<f64>| p.dot(&(weight * p));
