@@ -36,7 +36,7 @@ pub struct Separation {
 pub enum SeparationOutcome {
     /// The best half-space.
     Found(Separation),
-    /// The clearance has no bound: the origin is not inside the sets.
+    /// The clearance has no bound, which needs the origin outside the sets.
     Unbounded,
     /// The solver failed.
     Failed,
@@ -257,10 +257,16 @@ mod tests {
     }
 
     #[test]
-    fn origin_outside_leaves_the_clearance_unbounded() {
+    fn origin_outside_can_leave_the_clearance_unbounded() {
+        // 1 <= x <= 2, |y| <= 1. No half-space {h y <= 1} can be turned further and further about
+        // the set if the point lies on a ray through it.
         let set = square([2.0, 1.0, -1.0, 1.0]);
-        let x = DVector::from_vec(vec![3.0, 2.5]);
-        assert_eq!(separate_from_polytopes(&[of(&set)], &x), SeparationOutcome::Unbounded);
+        let hidden = DVector::from_vec(vec![3.0, 2.5]);
+        assert!(
+            (found(separate_from_polytopes(&[of(&set)], &hidden)).clearance - 1.5).abs() < 1e-8
+        );
+        let aside = DVector::from_vec(vec![1.0, 3.0]);
+        assert_eq!(separate_from_polytopes(&[of(&set)], &aside), SeparationOutcome::Unbounded);
     }
 
     #[test]
