@@ -17,6 +17,8 @@
 //!
 //! References, cited by key throughout:
 //!
+//! - **\[AguilarMarsillach2022\]** Aguilar Marsillach, Di Cairano, Weiss, "Abort-Safe Spacecraft
+//!   Rendezvous on Elliptic Orbits", IEEE TCST 2022, TR2022-142.
 //! - **\[Quartullo2025a\]** Quartullo, Bianchini, Garulli, Giannitrapani, Leomanni, "Robust Variable
 //!   Horizon Model Predictive Control for Rendezvous with Rotating Target", JGCD 2025,
 //!   doi 10.2514/1.G008874.

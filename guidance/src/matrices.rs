@@ -1,6 +1,6 @@
 //! Dense arithmetic in a fixed order, so that artifacts have the same bytes on every machine.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, SMatrix};
 
 /// A B, summed over the inner index in order.
 pub(crate) fn product(a: &DMatrix<f64>, b: &DMatrix<f64>) -> DMatrix<f64> {
@@ -223,4 +223,20 @@ fn rotate(m: &mut DMatrix<f64>, p: usize, q: usize) -> bool {
     m[(p, q)] = 0.0;
     m[(q, p)] = 0.0;
     true
+}
+
+/// A B for matrices whose shapes are known, summed over the inner index in order.
+pub(crate) fn product_fixed<const R: usize, const I: usize, const C: usize>(
+    a: &SMatrix<f64, R, I>,
+    b: &SMatrix<f64, I, C>,
+) -> SMatrix<f64, R, C> {
+    SMatrix::from_fn(|i, j| (0..I).map(|k| a[(i, k)] * b[(k, j)]).sum())
+}
+
+/// A' B for matrices whose shapes are known, summed over the inner index in order.
+pub(crate) fn transposed_fixed_product<const R: usize, const I: usize, const C: usize>(
+    a: &SMatrix<f64, I, R>,
+    b: &SMatrix<f64, I, C>,
+) -> SMatrix<f64, R, C> {
+    SMatrix::from_fn(|i, j| (0..I).map(|k| a[(k, i)] * b[(k, j)]).sum())
 }

@@ -1,24 +1,40 @@
 //! Optimisation programs: what is asked ([`HorizonProgram`]), how ([`Solver`]), what came of it
 //! ([`Solution`]), and whether it is true ([`verify`], which trusts no solver).
 //!
-//! Beside them two smaller kinds: [`least_impulses`] and, over second-order cones, [`ConeProgram`].
+//! Beside them stand smaller kinds: [`least_impulses`] and, over second-order cones,
+//! [`ConeProgram`]; dense quadratic programs with very many rows ([`QuadraticProgram`],
+//! [`DualActiveSet`], [`verify_quadratic`]).
 
 mod anchors;
 mod clarabel;
+mod common_margin;
 mod dual_simplex;
 mod gauge;
 mod impulses;
 mod projection;
+mod quadratic;
+mod regulator;
 mod second_order;
+mod separation;
 mod tables;
 mod verify;
 
 pub use clarabel::{Clarabel, RelaxedFamily, least_relaxation};
+pub use common_margin::{CommonMargin, MarginAnswer};
 pub use dual_simplex::DualSimplex;
 pub use gauge::zonotope_gauge;
 pub use impulses::{Impulses, impulse_bound, least_impulses, least_limit};
 pub use projection::project_onto_polytope;
+pub use quadratic::{
+    ActiveRow, DenseRows, DualActiveSet, InfeasibilityProof, NotPositiveDefinite, QuadraticCost,
+    QuadraticProgram, QuadraticResiduals, QuadraticSolution, prove_infeasible, verify_quadratic,
+};
+pub use regulator::{CondensedRegulator, RegulatorAnswer, RegulatorProgram, Softness, StateCut};
 pub use second_order::{Affine, ConeProgram, ConeSolution};
+pub use separation::{
+    HalfSpaces, Separation, SeparationOutcome, nearest_point_of_polytope, polytope_is_empty,
+    separate_from_ellipsoids, separate_from_polytopes,
+};
 pub use tables::PlantTables;
 pub use verify::{
     DualBound, Residual, Residuals, dual_bound, farkas_contradiction, farkas_margin, simulate,

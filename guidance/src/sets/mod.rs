@@ -1,12 +1,16 @@
 //! Convex sets that speak by their support function.
 
+mod centred_ellipsoid;
 mod ellipsoid;
 mod polytope;
 mod zonotope;
+mod zonotope_facets;
 
+pub use centred_ellipsoid::{CentredEllipsoid, Tangent};
 pub use ellipsoid::{Ellipsoid, EllipsoidError, OuterSum};
 pub use polytope::Polytope;
 pub use zonotope::{Zonotope, ZonotopeGauge, ZonotopeMeasure};
+pub use zonotope_facets::ZonotopeFacets;
 
 use nalgebra::DVector;
 

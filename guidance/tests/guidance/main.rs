@@ -2,9 +2,13 @@
 
 #![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
 
+mod abort_safety;
 mod disturbance_feedback_golden;
 mod disturbance_feedback_laws;
 mod golden;
+mod golden_abort_safe;
 mod laws;
 mod orbital_motion;
+mod quadratic;
+mod two_body_truth;
 mod uncertainty;

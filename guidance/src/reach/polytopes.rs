@@ -1,0 +1,313 @@
+//! Backward reachable sets of a polytope for thrust modes, for every start along the orbit.
+
+use std::ops::Range;
+
+use nalgebra::{DMatrix, DVector, SMatrix, Vector3};
+
+use crate::{
+    dynamics::{HeldStep, PeriodicPlant, RelativeVector},
+    matrices::product_fixed,
+    program::polytope_is_empty,
+    sets::Polytope,
+};
+
+/// For every start k of a range, every mode and every instant after the start, the states at k
+/// from which the craft is in the polytope at that instant *whatever* its working thrusters do:
+/// {x : H_j x <= l_j}. [AguilarMarsillach2022, eqs. 20, 21]
+///
+/// The normals are the same for all modes; only offsets differ. No row is ever redundant by
+/// construction of the recursion, and none is looked for: a box keeps its 12 rows.
+///
+/// Being in one of these sets is "there is an instant such that for all thrusts"; being unable to
+/// abort is "for all thrusts there is an instant". The first implies the second, and not the other
+/// way round: proposition III.1 fails. See [`super::find_abort`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct PolytopeUnion {
+    first: usize,
+    rows: usize,
+    modes: usize,
+    starts: Vec<StartSets>,
+}
+
+/// The sets of one start.
+#[derive(Debug, Clone, PartialEq, Default)]
+struct StartSets {
+    /// instants x rows x 6 values, for the instants of `kept`.
+    normals: Vec<f64>,
+    /// Instants at which some mode's set is not empty, ascending.
+    kept: Vec<usize>,
+    /// (place in `kept`, mode), ascending.
+    sets: Vec<(usize, usize)>,
+    /// rows values a set.
+    offsets: Vec<f64>,
+}
+
+/// One set of the union.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ReachablePolytope<'a> {
+    /// Which of the modes.
+    pub mode: usize,
+    /// Instant after the start, in parts of a step.
+    pub instant: usize,
+    /// rows x 6 values, row by row.
+    pub normals: &'a [f64],
+    /// One a row.
+    pub offsets: &'a [f64],
+}
+
+/// What a union is made of.
+#[derive(Debug, Clone, Copy)]
+pub struct PolytopeQuestion<'a> {
+    /// The plant, with its parts of steps.
+    pub plant: &'a PeriodicPlant,
+    /// The polytope of states to avoid.
+    pub avoid: &'a Polytope,
+    /// Force of each thruster at full thrust, newtons, RTN.
+    pub full_forces_n: &'a [Vector3<f64>],
+    /// Bits of the working thrusters of each mode.
+    pub modes: &'a [u32],
+    /// Safety horizon N, steps.
+    pub horizon: usize,
+}
+
+impl PolytopeUnion {
+    /// The sets of the starts `starts`.
+    ///
+    /// # Panics
+    /// If the polytope is not six-dimensional.
+    #[must_use]
+    pub fn new(question: &PolytopeQuestion<'_>, starts: Range<usize>) -> Self {
+        let avoid = question.avoid;
+        assert_eq!(avoid.normals().ncols(), 6, "a polytope of relative states");
+        let emptiness = Emptiness::of(avoid);
+        Self {
+            first: starts.start,
+            rows: avoid.offsets().len(),
+            modes: question.modes.len(),
+            starts: starts.map(|k| sets_of_start(question, &emptiness, k)).collect(),
+        }
+    }
+
+    /// Puts ranges of starts that follow each other together; `None` if they do not.
+    #[must_use]
+    pub fn joined(parts: Vec<Self>) -> Option<Self> {
+        let mut parts = parts.into_iter();
+        let mut whole = parts.next()?;
+        for part in parts {
+            let follows = part.first == whole.first + whole.starts.len()
+                && (part.rows, part.modes) == (whole.rows, whole.modes);
+            if !follows {
+                return None;
+            }
+            whole.starts.extend(part.starts);
+        }
+        Some(whole)
+    }
+
+    /// Number of sets that are not empty.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.starts.iter().map(|start| start.sets.len()).sum()
+    }
+
+    /// No set at all?
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Bytes of all numbers.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        let of = |start: &StartSets| {
+            (start.normals.len() + start.offsets.len()) * size_of::<f64>()
+                + start.kept.len() * size_of::<usize>()
+                + start.sets.len() * size_of::<(usize, usize)>()
+        };
+        self.starts.iter().map(of).sum()
+    }
+
+    /// The sets of start k (folded into the period), by instant, then by mode.
+    pub fn sets(&self, k: usize) -> impl Iterator<Item = ReachablePolytope<'_>> {
+        let count = self.starts.len().max(1);
+        let start = &self.starts[(k + count - self.first % count) % count];
+        start.sets.iter().enumerate().map(|(i, &(place, mode))| ReachablePolytope {
+            mode,
+            instant: start.kept[place],
+            normals: &start.normals[place * self.rows * 6..][..self.rows * 6],
+            offsets: &start.offsets[i * self.rows..][..self.rows],
+        })
+    }
+
+    /// The `count` sets of start k in which `x` is deepest or to which it is nearest, by
+    /// [`ReachablePolytope::nearness`], nearest first.
+    #[must_use]
+    pub fn nearest(
+        &self,
+        k: usize,
+        x: &RelativeVector,
+        count: usize,
+    ) -> Vec<(f64, ReachablePolytope<'_>)> {
+        let mut near: Vec<(f64, ReachablePolytope<'_>)> = Vec::with_capacity(count + 1);
+        for set in self.sets(k) {
+            let nearness = set.nearness(x);
+            if near.len() < count || near.last().is_some_and(|last| nearness < last.0) {
+                let place = near.partition_point(|other| other.0 <= nearness);
+                near.insert(place, (nearness, set));
+                near.truncate(count);
+            }
+        }
+        near
+    }
+}
+
+impl ReachablePolytope<'_> {
+    /// H_i x - l_i, row by row: all at most 0 inside.
+    #[must_use]
+    pub fn excess(&self, x: &RelativeVector) -> Vec<f64> {
+        self.normals
+            .chunks_exact(6)
+            .zip(self.offsets)
+            .map(|(h, l)| (0..6).map(|j| h[j] * x[j]).sum::<f64>() - l)
+            .collect()
+    }
+
+    /// Is the state in the set?
+    #[must_use]
+    pub fn contains(&self, x: &RelativeVector) -> bool {
+        self.excess(x).iter().all(|&e| e <= 0.0)
+    }
+
+    /// max_i H_i x / l_i where the origin is inside, the gauge; else 1 plus the largest excess by
+    /// the size of its own terms. Without a unit either way, at most 1 inside.
+    #[must_use]
+    pub fn nearness(&self, x: &RelativeVector) -> f64 {
+        let gauge = self.offsets.iter().all(|&l| l > 0.0);
+        let rows = self.normals.chunks_exact(6).zip(self.offsets);
+        let values = rows.map(|(h, &l)| {
+            let product: f64 = (0..6).map(|j| h[j] * x[j]).sum();
+            if gauge {
+                return product / l;
+            }
+            let size = l.abs() + (0..6).map(|j| (h[j] * x[j]).abs()).sum::<f64>();
+            1.0 + (product - l) / size.max(f64::MIN_POSITIVE)
+        });
+        values.fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    /// The set as a polytope of its own.
+    #[must_use]
+    pub fn polytope(&self) -> Polytope {
+        Polytope::new(
+            DMatrix::from_row_slice(self.offsets.len(), 6, self.normals),
+            DVector::from_column_slice(self.offsets),
+        )
+    }
+}
+
+/// How emptiness of {x : H Phi x <= l} is decided; Phi can be inverted, so H alone matters.
+enum Emptiness {
+    /// H = [M; -M] with M square and regular: empty if and only if some l_i + l_{i + 6} < 0.
+    Box,
+    /// A linear program over the original normals.
+    General(DMatrix<f64>),
+}
+
+impl Emptiness {
+    fn of(avoid: &Polytope) -> Self {
+        let normals = avoid.normals();
+        let paired = normals.nrows() == 12
+            && normals.rows(0, 6) == -normals.rows(6, 6)
+            && normals.rows(0, 6).into_owned().try_inverse().is_some();
+        if paired { Self::Box } else { Self::General(normals.clone()) }
+    }
+
+    fn is_empty(&self, offsets: &[f64]) -> bool {
+        match self {
+            Self::Box => (0..6).any(|i| offsets[i] + offsets[i + 6] < 0.0),
+            Self::General(normals) => {
+                polytope_is_empty(normals, &DVector::from_column_slice(offsets))
+            }
+        }
+    }
+}
+
+fn sets_of_start(question: &PolytopeQuestion<'_>, emptiness: &Emptiness, k: usize) -> StartSets {
+    let mut found = StartSets::default();
+    let parts = question.plant.fraction_count();
+    for instant in 0..=question.horizon * parts {
+        let Some(chain) = Chain::back_from(question, emptiness, k, instant) else { continue };
+        found.normals.extend(chain.normals.iter().flat_map(|row| row.iter().copied()));
+        for (mode, offsets) in chain.offsets.into_iter().enumerate() {
+            if let Some(offsets) = offsets {
+                found.sets.push((found.kept.len(), mode));
+                found.offsets.extend(offsets);
+            }
+        }
+        found.kept.push(instant);
+    }
+    found
+}
+
+/// The sets of all modes for one final instant, taken back step by step.
+struct Chain {
+    normals: Vec<SMatrix<f64, 1, 6>>,
+    /// `None` once empty: then empty for ever.
+    offsets: Vec<Option<Vec<f64>>>,
+}
+
+impl Chain {
+    /// From `instant` back to start k; `None` if every mode's set is empty.
+    fn back_from(
+        question: &PolytopeQuestion<'_>,
+        emptiness: &Emptiness,
+        k: usize,
+        instant: usize,
+    ) -> Option<Self> {
+        let (plant, avoid) = (question.plant, question.avoid);
+        let (steps, part) = (instant / plant.fraction_count(), instant % plant.fraction_count());
+        let offsets = avoid.offsets().as_slice().to_vec();
+        let mut chain = Self {
+            normals: avoid
+                .normals()
+                .row_iter()
+                .map(|row| row.fixed_columns::<6>(0).into_owned())
+                .collect(),
+            offsets: vec![Some(offsets); question.modes.len()],
+        };
+        if part > 0 {
+            chain.back(question, emptiness, plant.fraction(k + steps, part));
+        }
+        for j in (0..steps).rev() {
+            if chain.offsets.iter().all(Option::is_none) {
+                return None;
+            }
+            chain.back(question, emptiness, plant.step(k + j));
+        }
+        chain.offsets.iter().any(Option::is_some).then_some(chain)
+    }
+
+    /// One step of (20): H <- H A, l <- min over u of l - H B u, which takes each working
+    /// thruster's push along the row.
+    fn back(&mut self, question: &PolytopeQuestion<'_>, emptiness: &Emptiness, step: &HeldStep) {
+        for (i, row) in self.normals.iter_mut().enumerate() {
+            let along = product_fixed(row, &step.b);
+            let push: Vec<f64> = question
+                .full_forces_n
+                .iter()
+                .map(|force| (0..3).map(|c| along[c] * force[c]).sum::<f64>().max(0.0))
+                .collect();
+            for (bits, offsets) in question.modes.iter().zip(&mut self.offsets) {
+                let Some(offsets) = offsets else { continue };
+                let working = push.iter().enumerate().filter(|(j, _)| bits >> j & 1 == 1);
+                offsets[i] -= working.map(|(_, push)| push).sum::<f64>();
+            }
+            *row = product_fixed(row, &step.a);
+        }
+        for offsets in &mut self.offsets {
+            if offsets.as_ref().is_some_and(|offsets| emptiness.is_empty(offsets)) {
+                *offsets = None;
+            }
+        }
+    }
+}
