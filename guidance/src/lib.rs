@@ -12,7 +12,7 @@
 //! | 4 | [`control`]: one folder a method |
 //! | 3 | [`mission`], [`reach`] |
 //! | 2 | [`dynamics`] |
-//! | 1 | [`sets`], [`program`] |
+//! | 1 | [`sets`], [`program`], [`sampling`] |
 //! | 0 | [`units`], [`frames`], [`budget`], [`bytes`], `matrices` |
 //!
 //! References, cited by key throughout:
@@ -22,6 +22,9 @@
 //!   doi 10.2514/1.G008874.
 //! - **\[Quartullo2025b\]** Quartullo, Bianchini, Garulli, Giannitrapani, "Robust Variable-Horizon
 //!   MPC with Adaptive Terminal Constraints", Automatica 179, 2025, 112465.
+//! - **\[Mammarella2019\]** Mammarella, Lorenzen, Capello, Park, Dabbene, Guglieri, Romano,
+//!   Allgoewer, "An Offline-Sampling SMPC Framework with Application to Automated Space Maneuvers",
+//!   IEEE TCST 2019, doi 10.1109/TCST.2018.2879938.
 
 pub mod budget;
 pub mod bytes;
@@ -32,6 +35,7 @@ mod matrices;
 pub mod mission;
 pub mod program;
 pub mod reach;
+pub mod sampling;
 pub mod sets;
 pub mod units;
 
