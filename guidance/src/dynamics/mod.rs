@@ -1,9 +1,21 @@
-//! Dynamics of relative motion, and feedback gains for them.
+//! Dynamics of relative motion, certain and uncertain, feedback gains and costs for them.
 
 mod clohessy_wiltshire;
+mod expected_cost;
 mod gain;
+mod poseidyn;
 mod scaling;
+mod transfer;
+mod uncertain_plant;
+mod zero_order_hold;
 
 pub use clohessy_wiltshire::clohessy_wiltshire;
+pub use expected_cost::{ExpectedCost, StageWeights, TerminalCostError, terminal_cost};
 pub use gain::{GainError, linear_quadratic_regulator, place_poles, spectral_radius};
+pub use poseidyn::{PoseidynVariant, poseidyn};
 pub use scaling::HillScaling;
+pub use transfer::{Prediction, Transfer};
+pub use uncertain_plant::{
+    Discretisation, MatrixPolynomial, Monomial, PlantMatrices, UncertainPlant, UncertainPlantError,
+};
+pub use zero_order_hold::zero_order_hold;
