@@ -19,6 +19,7 @@ pub use quadratic::{
     ActiveRow, DenseRows, DualActiveSet, InfeasibilityProof, NotPositiveDefinite, QuadraticCost,
     QuadraticProgram, QuadraticResiduals, QuadraticSolution, prove_infeasible, verify_quadratic,
 };
+pub(crate) use quadratic::{ActiveSet, Entry};
 pub use tables::PlantTables;
 pub use verify::{DualBound, Residual, Residuals, dual_bound, farkas_margin, simulate, verify};
 

@@ -5,3 +5,5 @@
 mod golden;
 mod laws;
 mod quadratic;
+mod redundancy;
+mod scenario;
