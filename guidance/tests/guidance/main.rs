@@ -3,6 +3,7 @@
 #![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
 
 mod golden;
+mod golden_offline_sampling;
 mod laws;
 mod quadratic;
 mod redundancy;
