@@ -13,7 +13,7 @@
 
 use nalgebra::DMatrix;
 
-use super::{HalfSpaces, InteriorPoint, NoInterior};
+use super::{HalfSpaces, InteriorPoint, NoInterior, dominance::Dominance};
 use crate::{
     budget::{Budget, Interruption},
     program::{ActiveSet, DenseRows, Entry, QuadraticCost},
@@ -29,6 +29,8 @@ const TIE: f64 = 1e-11;
 const MISFIT_MAX: f64 = 1e-8;
 /// Rows that took part in recent certificates are tried first.
 const RECENT_MAX: usize = 96;
+/// Below so many candidates a box around the set does not pay.
+const DOMINANCE_WORTHWHILE: usize = 500;
 /// Rows between two looks at the budget.
 const BUDGET_PERIOD: usize = 64;
 
@@ -80,6 +82,10 @@ pub fn irredundant(
     all.extend(context);
     let interior = all.interior_point(budget)?;
     let mut search = Search::new(&all, candidates.len(), &interior, tolerance)?;
+    if !context.is_empty() && candidates.len() > DOMINANCE_WORTHWHILE {
+        // Only rows that stay may carry the box, or rows could remove each other.
+        search.dominance = Dominance::new(&search.context_rows(), budget)?;
+    }
     for row in 0..candidates.len() {
         if row % BUDGET_PERIOD == 0 {
             budget.check()?;
@@ -103,7 +109,7 @@ enum Fate {
 }
 
 struct Search {
-    /// a_i y <= 1, candidates first, then the context.
+    /// a_i y <= 1, candidates first, then the context, in coordinates that make the set round.
     polar: DenseRows,
     candidates: usize,
     fate: Vec<Fate>,
@@ -117,6 +123,7 @@ struct Search {
     doubtful: usize,
     /// Two different rows were met at once: one of them may have been taken for needed wrongly.
     ties: bool,
+    dominance: Option<Dominance>,
     active: ActiveSet,
     padded: Vec<f64>,
     reversed: Vec<f64>,
@@ -153,11 +160,20 @@ impl Search {
                 }
             }
         }
-        // The mean of a a' as a metric makes the set round, whatever the units.
+        // Coordinates in which the mean of a a' is the identity make the set round, whatever the
+        // units.
         moments /= all.len().max(1) as f64;
         let floor = 1e-9 * moments.trace().max(f64::MIN_POSITIVE) / n as f64;
-        let cost = QuadraticCost::new(moments + DMatrix::identity(n, n) * floor)
+        let metric = QuadraticCost::new(moments + DMatrix::identity(n, n) * floor)
             .map_err(|_| NoInterior::Numerical)?;
+        let mut round = DenseRows::new(n);
+        for row in 0..polar.len() {
+            let a = polar.normal(row);
+            for (k, component) in normal.iter_mut().enumerate() {
+                *component = metric.factor_column(k).iter().zip(a).map(|(j, a)| j * a).sum();
+            }
+            round.push(&normal);
+        }
         Ok(Self {
             fate: vec![Fate::Open; candidates],
             needed: (candidates..all.len()).collect(),
@@ -168,17 +184,29 @@ impl Search {
             outer_excess: 0.0,
             doubtful: 0,
             ties: false,
-            polar,
+            dominance: None,
+            polar: round,
             candidates,
             tolerance,
-            cost,
+            cost: QuadraticCost::identity(n),
         })
+    }
+
+    /// The rows that stay in any case.
+    fn context_rows(&self) -> DenseRows {
+        let mut rows = DenseRows::new(self.polar.columns());
+        (self.candidates..self.polar.len()).for_each(|row| rows.push(self.polar.normal(row)));
+        rows
     }
 
     /// Settles the fate of an open row, and finds other needed rows on the way.
     fn decide(&mut self, row: usize) {
         if self.polar.normal(row).iter().all(|&a| a == 0.0) {
             // 0 <= b with b > 0, since the interior point satisfies it.
+            self.fate[row] = Fate::Removed;
+            return;
+        }
+        if self.dominance.as_mut().is_some_and(|front| front.dominated(&self.polar, row)) {
             self.fate[row] = Fate::Removed;
             return;
         }
@@ -196,6 +224,9 @@ impl Search {
                     self.fate[worst] = Fate::Needed;
                     self.needed.push(worst);
                     self.touch(worst);
+                    if let Some(front) = &mut self.dominance {
+                        front.add(worst);
+                    }
                 }
             }
             if self.fate[row] != Fate::Open {

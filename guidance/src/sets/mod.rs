@@ -1,8 +1,10 @@
 //! Convex sets that speak by their support function.
 
+mod hull;
 mod polytope;
 mod zonotope;
 
+pub use hull::{Hull, HullError, vertices};
 pub use polytope::Polytope;
 pub use zonotope::{Zonotope, ZonotopeGauge, ZonotopeMeasure};
 

@@ -4,6 +4,7 @@
 
 mod golden;
 mod golden_offline_sampling;
+mod growth;
 mod laws;
 mod quadratic;
 mod redundancy;
