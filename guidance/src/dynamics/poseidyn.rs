@@ -1,4 +1,4 @@
-//! The floating spacecraft simulator of [Mammarella2019, sec. III]: a planar chaser on air bearings.
+//! The floating spacecraft of [Mammarella2019, sec. III]: a planar chaser on air bearings.
 
 use nalgebra::DMatrix;
 

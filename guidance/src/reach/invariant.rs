@@ -180,7 +180,8 @@ fn max_invariant(
 
 /// {(x, u) : A_j x + B_j u + w in the set for every j and w}: every row times every vertex, its
 /// offset less the support of the disturbance.
-pub(super) fn step_back(set: &HalfSpaces, vertices: &[PlantVertex<'_>]) -> HalfSpaces {
+#[must_use]
+pub fn step_back(set: &HalfSpaces, vertices: &[PlantVertex<'_>]) -> HalfSpaces {
     let columns = vertices.first().map_or(0, |v| v.a.ncols() + v.b.ncols());
     let mut rows = HalfSpaces::new(columns);
     let mut normal = vec![0.0; columns];

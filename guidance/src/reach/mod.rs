@@ -16,9 +16,9 @@ pub use growth::{Growth, GrowthError, GrowthLimits, grow_control_invariant};
 pub use half_spaces::{HalfSpaces, InteriorPoint, NoInterior};
 pub use invariant::{
     Invariant, InvariantLimits, PlantVertex, max_robust_control_invariant,
-    max_robust_positive_invariant,
+    max_robust_positive_invariant, step_back,
 };
 pub use redundancy::{EXACT, Reduction, irredundant};
 pub use sampled_constraints::{StageConstraints, StageFamily, StageGroup};
-pub use scenario::Scenario;
+pub use scenario::{SampledRows, Scenario};
 pub use tube::{Decrease, Tube, TubeError};

@@ -42,11 +42,36 @@ pub struct Scenario<'a> {
     pub seed: u64,
 }
 
+/// Rows that remember their group.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SampledRows {
+    /// Over (x, v_0 .. v_{T-1}).
+    pub rows: HalfSpaces,
+    /// Index of the group of every row.
+    pub groups: Vec<usize>,
+}
+
+impl SampledRows {
+    fn select(&self, kept: &[usize]) -> Self {
+        Self {
+            rows: self.rows.select(kept),
+            groups: kept.iter().map(|&row| self.groups[row]).collect(),
+        }
+    }
+
+    fn extend(&mut self, rows: &HalfSpaces, groups: impl IntoIterator<Item = usize>) {
+        self.rows.extend(rows);
+        self.groups.extend(groups);
+        debug_assert_eq!(self.rows.len(), self.groups.len());
+    }
+}
+
 impl Scenario<'_> {
-    /// The prediction of sample `sample` of stream `group`, over `steps` steps.
+    /// The prediction of sample `sample`, over `steps` steps; `stream` is the index of a group, or
+    /// any other number for samples apart from those of the groups.
     #[must_use]
-    pub fn prediction(&self, group: usize, sample: usize, steps: usize) -> Prediction {
-        let mut stream = Stream::new(self.seed, group as u64, sample as u64);
+    pub fn prediction(&self, stream: u64, sample: usize, steps: usize) -> Prediction {
+        let mut stream = Stream::new(self.seed, stream, sample as u64);
         let mut matrices: Vec<PlantMatrices> = Vec::with_capacity(steps);
         let mut disturbances = Vec::with_capacity(steps);
         for _ in 0..steps {
@@ -76,10 +101,15 @@ impl Scenario<'_> {
             if sample % BUDGET_PERIOD == 0 {
                 budget.check()?;
             }
-            let prediction = self.prediction(group, sample, stage_group.steps());
+            let prediction = self.prediction(group as u64, sample, stage_group.steps());
             self.constraints.push_rows(stage_group, &prediction, &mut rows);
         }
-        Ok(rows)
+        // All samples of one constraint, then of the next: neighbours are nearly parallel, and a
+        // row that lies behind another is found at once.
+        let faces = self.constraints.of(stage_group.family).len();
+        let order: Vec<usize> =
+            (0..faces).flat_map(|face| (face..rows.len()).step_by(faces)).collect();
+        Ok(rows.select(&order))
     }
 
     /// Rows of all groups, had none been removed.
@@ -97,15 +127,16 @@ impl Scenario<'_> {
     ///
     /// # Errors
     /// [`NoInterior`]: the sampled set is empty or flat already.
-    pub fn context(&self, budget: Budget<'_>) -> Result<HalfSpaces, NoInterior> {
+    pub fn context(&self, budget: Budget<'_>) -> Result<SampledRows, NoInterior> {
         let (m, n) = self.gain.shape();
-        let mut rows = HalfSpaces::new(n + self.horizon * m);
+        let none = HalfSpaces::new(n + self.horizon * m);
+        let mut all = SampledRows { rows: none.clone(), groups: Vec::new() };
         for group in 0..self.groups.len() {
-            rows.extend(&self.rows(group, 0..CONTEXT_SAMPLES.min(self.sizes[group]), budget)?);
+            let rows = self.rows(group, 0..CONTEXT_SAMPLES.min(self.sizes[group]), budget)?;
+            all.extend(&rows, std::iter::repeat_n(group, rows.len()));
         }
-        let none = HalfSpaces::new(rows.dimension());
-        let kept = irredundant(&rows, &none, EXACT, budget)?.kept;
-        Ok(rows.select(&kept))
+        let kept = irredundant(&all.rows, &none, EXACT, budget)?.kept;
+        Ok(all.select(&kept))
     }
 
     /// The rows of a group that are needed beside the context.
@@ -115,13 +146,13 @@ impl Scenario<'_> {
     pub fn survivors(
         &self,
         group: usize,
-        context: &HalfSpaces,
+        context: &SampledRows,
         budget: Budget<'_>,
-    ) -> Result<HalfSpaces, NoInterior> {
+    ) -> Result<SampledRows, NoInterior> {
         let first = CONTEXT_SAMPLES.min(self.sizes[group]);
         let rows = self.rows(group, first..self.sizes[group], budget)?;
-        let kept = irredundant(&rows, context, EXACT, budget)?.kept;
-        Ok(rows.select(&kept))
+        let kept = irredundant(&rows, &context.rows, EXACT, budget)?.kept;
+        Ok(SampledRows { rows: rows.select(&kept), groups: vec![group; kept.len()] })
     }
 
     /// All survivors, in group order, and the context, reduced together; `tolerance` as in
@@ -130,17 +161,21 @@ impl Scenario<'_> {
     /// # Errors
     /// [`NoInterior`].
     pub fn merged(
-        context: &HalfSpaces,
-        survivors: &[HalfSpaces],
+        context: &SampledRows,
+        survivors: &[SampledRows],
         tolerance: f64,
         budget: Budget<'_>,
-    ) -> Result<(HalfSpaces, Reduction), NoInterior> {
-        let mut rows = context.clone();
-        survivors.iter().for_each(|part| rows.extend(part));
-        let none = HalfSpaces::new(rows.dimension());
-        let reduction = irredundant(&rows, &none, tolerance, budget)?;
-        let kept =
-            if tolerance > EXACT { reduction.inner(&rows) } else { rows.select(&reduction.kept) };
+    ) -> Result<(SampledRows, Reduction), NoInterior> {
+        let mut all = context.clone();
+        for part in survivors {
+            all.extend(&part.rows, part.groups.iter().copied());
+        }
+        let none = HalfSpaces::new(all.rows.dimension());
+        let reduction = irredundant(&all.rows, &none, tolerance, budget)?;
+        let mut kept = all.select(&reduction.kept);
+        if tolerance > EXACT {
+            kept.rows = reduction.inner(&all.rows);
+        }
         Ok((kept, reduction))
     }
 }
