@@ -12,7 +12,7 @@
 //! | 4 | [`control`]: one folder a method |
 //! | 3 | [`mission`], [`reach`] |
 //! | 2 | [`dynamics`] |
-//! | 1 | [`sets`], [`program`], [`orbit`] |
+//! | 1 | [`sets`], [`program`], [`orbit`], [`sampling`] |
 //! | 0 | [`units`], [`frames`], [`epoch`], [`budget`], [`bytes`], `matrices` |
 //!
 //! References, cited by key throughout:
@@ -31,6 +31,9 @@
 //!   Motion on an Arbitrary Elliptical Orbit", JGCD 25(1), 2002, pp. 60-66.
 //! - **\[Ros2002\]** Ros, Sabater, Thomas, "An Ellipsoidal Calculus Based on Propagation and
 //!   Fusion", IEEE Transactions on Systems, Man, and Cybernetics B 32(4), 2002, pp. 430-442.
+//! - **\[Mammarella2019\]** Mammarella, Lorenzen, Capello, Park, Dabbene, Guglieri, Romano,
+//!   Allgoewer, "An Offline-Sampling SMPC Framework with Application to Autonomous Space Maneuvers",
+//!   IEEE TCST 2019, doi 10.1109/TCST.2018.2879938.
 
 pub mod budget;
 pub mod bytes;
@@ -43,6 +46,7 @@ pub mod mission;
 pub mod orbit;
 pub mod program;
 pub mod reach;
+pub mod sampling;
 pub mod sets;
 pub mod units;
 

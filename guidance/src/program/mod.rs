@@ -29,6 +29,7 @@ pub use quadratic::{
     ActiveRow, DenseRows, DualActiveSet, InfeasibilityProof, NotPositiveDefinite, QuadraticCost,
     QuadraticProgram, QuadraticResiduals, QuadraticSolution, prove_infeasible, verify_quadratic,
 };
+pub(crate) use quadratic::{ActiveSet, Entry};
 pub use regulator::{CondensedRegulator, RegulatorAnswer, RegulatorProgram, Softness, StateCut};
 pub use second_order::{Affine, ConeProgram, ConeSolution};
 pub use separation::{

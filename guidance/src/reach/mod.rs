@@ -1,17 +1,36 @@
-//! Sets of states that error or drift can reach, or from which they can be reached.
+//! Sets that error, drift or control can reach, from which they can be reached, or in which a control
+//! law keeps them, and the few rows of many that say so.
 
 mod abort;
+mod dominance;
+mod elimination;
 mod ellipsoids;
 mod flight;
+mod growth;
+mod half_spaces;
+mod invariant;
 mod passive;
 mod polytopes;
+mod redundancy;
+mod sampled_constraints;
+mod scenario;
 mod separation;
 mod tube;
 
 pub use abort::{Abort, AbortQuestion, AbortVerdict, find_abort};
+pub use elimination::{EliminationError, project_out_last};
 pub use ellipsoids::{EllipsoidUnion, NearEllipsoid};
 pub use flight::{Closest, Flight};
+pub use growth::{Growth, GrowthError, GrowthLimits, grow_control_invariant};
+pub use half_spaces::{HalfSpaces, InteriorPoint, NoInterior};
+pub use invariant::{
+    Invariant, InvariantLimits, PlantVertex, max_robust_control_invariant,
+    max_robust_positive_invariant, step_back,
+};
 pub use passive::{PassiveQuestion, PassiveVerdict, passive_safety};
 pub use polytopes::{PolytopeQuestion, PolytopeUnion, ReachablePolytope};
+pub use redundancy::{EXACT, Reduction, irredundant};
+pub use sampled_constraints::{StageConstraints, StageFamily, StageGroup};
+pub use scenario::{SampledRows, Scenario};
 pub use separation::{Cut, cut_off_ellipsoid, cut_off_polytope};
 pub use tube::{Decrease, Tube, TubeError};

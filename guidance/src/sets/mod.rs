@@ -2,12 +2,14 @@
 
 mod centred_ellipsoid;
 mod ellipsoid;
+mod hull;
 mod polytope;
 mod zonotope;
 mod zonotope_facets;
 
 pub use centred_ellipsoid::{CentredEllipsoid, Tangent};
 pub use ellipsoid::{Ellipsoid, EllipsoidError, OuterSum};
+pub use hull::{Hull, HullError, vertices};
 pub use polytope::Polytope;
 pub use zonotope::{Zonotope, ZonotopeGauge, ZonotopeMeasure};
 pub use zonotope_facets::ZonotopeFacets;

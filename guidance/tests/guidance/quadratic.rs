@@ -46,10 +46,13 @@ struct Random {
 
 impl Random {
     fn new(seed: u64, trouble: Trouble) -> Self {
+        Self::sized(seed, trouble, 1 + (seed % 20) as usize, 1 + (seed * 7 % 150) as usize)
+    }
+
+    /// n variables, q rows, before what the trouble adds.
+    fn sized(seed: u64, trouble: Trouble, n: usize, q: usize) -> Self {
         let mut chance = ChaCha8Rng::seed_from_u64(seed);
         let mut draw = move || chance.random_range(-1.0..1.0_f64);
-        let n = 1 + (seed % 20) as usize;
-        let q = 1 + (seed * 7 % 150) as usize;
         let factor = DMatrix::from_fn(n, n, |_, _| draw());
         let mut hessian = &factor * factor.transpose() + DMatrix::identity(n, n) * 0.1;
         if trouble == Trouble::Stretched {
@@ -152,6 +155,15 @@ fn quadratic_agrees_with_clarabel_on_random_programs() {
     }
     // 350 of the 420 are feasible; the comparison must not be empty.
     assert!(optimal_by_clarabel > 300, "{optimal_by_clarabel}");
+}
+
+#[test]
+fn quadratic_with_ninety_variables_agrees_with_clarabel() {
+    // The size of a planner over thirty steps of three inputs.
+    for seed in 0..4 {
+        let random = Random::sized(seed, Trouble::Degenerate, 90, 300);
+        check(&format!("seed {seed}"), &random.program(), true);
+    }
 }
 
 #[test]

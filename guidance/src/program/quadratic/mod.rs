@@ -14,7 +14,7 @@ mod factors;
 mod verify;
 
 pub use dual_active_set::DualActiveSet;
-use factors::{ActiveSet, Entry};
+pub(crate) use factors::{ActiveSet, Entry};
 pub use verify::{InfeasibilityProof, QuadraticResiduals, prove_infeasible, verify_quadratic};
 
 use nalgebra::DMatrix;

@@ -1,0 +1,365 @@
+//! Which of very many half-spaces are needed.
+//!
+//! Around an interior point z_0 every row reads a_i y <= 1. A row is redundant if no y satisfies
+//! the others and has a_i y >= 1: a small feasibility program, whose Farkas ray writes a_i as a
+//! combination of other rows with weights that sum to at most 1. Most rows are refused by a
+//! handful of others, so the program is solved against the rows known to be needed only. Where
+//! they leave a point y, the row that this point violates most is needed for certain (the ray
+//! from z_0 to y leaves the set through it), whichever it is; so all rows are looked at only once
+//! for every needed row. Clarkson, "More output-sensitive geometric algorithms", FOCS 1994.
+//!
+//! Groups of rows can be reduced on their own and the survivors together ([`irredundant`] with a
+//! context), in any order and on any machine: a removed row rests on kept rows alone.
+
+use nalgebra::DMatrix;
+
+use super::{HalfSpaces, InteriorPoint, NoInterior, dominance::Dominance};
+use crate::{
+    budget::{Budget, Interruption},
+    program::{ActiveSet, DenseRows, Entry, QuadraticCost},
+};
+
+/// A removed row may be violated by this at most, relative to its distance from the interior
+/// point: rounding only.
+pub const EXACT: f64 = 1e-9;
+/// Two rows violated by the same, within rounding.
+const TIE: f64 = 1e-11;
+/// Misfit of a certificate, relative to the row: |a_i - sum y_j a_j|, in units in which the rows
+/// have size 1 on average.
+const MISFIT_MAX: f64 = 1e-8;
+/// Rows that took part in recent certificates are tried first.
+const RECENT_MAX: usize = 96;
+/// Below so many candidates a box around the set does not pay.
+const DOMINANCE_WORTHWHILE: usize = 500;
+/// Rows between two looks at the budget.
+const BUDGET_PERIOD: usize = 64;
+
+/// What is left of a set of rows, and what that costs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Reduction {
+    /// Indices of the rows that are needed, increasing.
+    pub kept: Vec<usize>,
+    /// The point about which rows are measured.
+    pub interior: InteriorPoint,
+    /// Every removed row i holds as a_i y <= 1 + this wherever the kept rows and the context do,
+    /// y measured from the interior point: the kept rows are an outer set by that factor. From
+    /// the certificates; at most the tolerance asked for.
+    pub outer_excess: f64,
+    /// Rows whose program did not end in a verified certificate; they were kept.
+    pub doubtful: usize,
+}
+
+impl Reduction {
+    /// The kept rows, moved towards the interior point by 1 / (1 + excess): an inner set, whose
+    /// every point satisfies the removed rows too.
+    #[must_use]
+    pub fn inner(&self, candidates: &HalfSpaces) -> HalfSpaces {
+        let mut inner = HalfSpaces::new(candidates.dimension());
+        for &row in &self.kept {
+            let normal = candidates.normal(row);
+            let at: f64 = normal.iter().zip(&self.interior.point).map(|(a, z)| a * z).sum();
+            let room = candidates.offset(row) - at;
+            inner.push(normal, at + room / (1.0 + self.outer_excess));
+        }
+        inner
+    }
+}
+
+/// Finds the rows of `candidates` that are needed beside the `context`, which is kept in any case.
+///
+/// `tolerance` is [`EXACT`], or a larger epsilon: then rows that cut off less than that are
+/// removed too, and only [`Reduction::inner`] of the result may be used where safety counts.
+///
+/// # Errors
+/// [`NoInterior`] if all rows together leave no room.
+pub fn irredundant(
+    candidates: &HalfSpaces,
+    context: &HalfSpaces,
+    tolerance: f64,
+    budget: Budget<'_>,
+) -> Result<Reduction, NoInterior> {
+    let mut all = candidates.clone();
+    all.extend(context);
+    let interior = all.interior_point(budget)?;
+    let mut search = Search::new(&all, candidates.len(), &interior, tolerance)?;
+    if !context.is_empty() && candidates.len() > DOMINANCE_WORTHWHILE {
+        // Only rows that stay may carry the box, or rows could remove each other.
+        search.dominance = Dominance::new(&search.context_rows(), budget)?;
+    }
+    for row in 0..candidates.len() {
+        if row % BUDGET_PERIOD == 0 {
+            budget.check()?;
+        }
+        if search.fate[row] == Fate::Open {
+            search.decide(row);
+        }
+    }
+    if search.ties {
+        search.clean_up(budget)?;
+    }
+    let kept = (0..candidates.len()).filter(|&row| search.fate[row] == Fate::Needed).collect();
+    Ok(Reduction { kept, interior, outer_excess: search.outer_excess, doubtful: search.doubtful })
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fate {
+    Open,
+    Needed,
+    Removed,
+}
+
+struct Search {
+    /// a_i y <= 1, candidates first, then the context, in coordinates that make the set round.
+    polar: DenseRows,
+    candidates: usize,
+    fate: Vec<Fate>,
+    tolerance: f64,
+    cost: QuadraticCost,
+    /// Rows known to be needed, the context first.
+    needed: Vec<usize>,
+    /// Those of recent certificates, the latest last.
+    recent: Vec<usize>,
+    outer_excess: f64,
+    doubtful: usize,
+    /// Two different rows were met at once: one of them may have been taken for needed wrongly.
+    ties: bool,
+    dominance: Option<Dominance>,
+    active: ActiveSet,
+    padded: Vec<f64>,
+    reversed: Vec<f64>,
+}
+
+/// How a feasibility program ended.
+enum Outcome {
+    Redundant,
+    /// The needed rows leave a point, kept in the active set.
+    Open,
+    Doubtful,
+}
+
+impl Search {
+    fn new(
+        all: &HalfSpaces,
+        candidates: usize,
+        interior: &InteriorPoint,
+        tolerance: f64,
+    ) -> Result<Self, NoInterior> {
+        let n = all.dimension();
+        let mut polar = DenseRows::new(n);
+        let mut moments = DMatrix::zeros(n, n);
+        let mut normal = vec![0.0; n];
+        for row in 0..all.len() {
+            let a = all.normal(row);
+            let at: f64 = a.iter().zip(&interior.point).map(|(a, z)| a * z).sum();
+            let room = all.offset(row) - at;
+            normal.iter_mut().zip(a).for_each(|(scaled, a)| *scaled = a / room);
+            polar.push(&normal);
+            for i in 0..n {
+                for j in 0..n {
+                    moments[(i, j)] += normal[i] * normal[j];
+                }
+            }
+        }
+        // Coordinates in which the mean of a a' is the identity make the set round, whatever the
+        // units.
+        moments /= all.len().max(1) as f64;
+        let floor = 1e-9 * moments.trace().max(f64::MIN_POSITIVE) / n as f64;
+        let metric = QuadraticCost::new(moments + DMatrix::identity(n, n) * floor)
+            .map_err(|_| NoInterior::Numerical)?;
+        let mut round = DenseRows::new(n);
+        for row in 0..polar.len() {
+            let a = polar.normal(row);
+            for (k, component) in normal.iter_mut().enumerate() {
+                *component = metric.factor_column(k).iter().zip(a).map(|(j, a)| j * a).sum();
+            }
+            round.push(&normal);
+        }
+        Ok(Self {
+            fate: vec![Fate::Open; candidates],
+            needed: (candidates..all.len()).collect(),
+            recent: Vec::new(),
+            reversed: vec![0.0; n],
+            padded: Vec::new(),
+            active: ActiveSet::default(),
+            outer_excess: 0.0,
+            doubtful: 0,
+            ties: false,
+            dominance: None,
+            polar: round,
+            candidates,
+            tolerance,
+            cost: QuadraticCost::identity(n),
+        })
+    }
+
+    /// The rows that stay in any case.
+    fn context_rows(&self) -> DenseRows {
+        let mut rows = DenseRows::new(self.polar.columns());
+        (self.candidates..self.polar.len()).for_each(|row| rows.push(self.polar.normal(row)));
+        rows
+    }
+
+    /// Settles the fate of an open row, and finds other needed rows on the way.
+    fn decide(&mut self, row: usize) {
+        if self.polar.normal(row).iter().all(|&a| a == 0.0) {
+            // 0 <= b with b > 0, since the interior point satisfies it.
+            self.fate[row] = Fate::Removed;
+            return;
+        }
+        if self.dominance.as_mut().is_some_and(|front| front.dominated(&self.polar, row)) {
+            self.fate[row] = Fate::Removed;
+            return;
+        }
+        self.begin(row);
+        loop {
+            match self.against_needed(row, None) {
+                Outcome::Redundant => self.fate[row] = Fate::Removed,
+                Outcome::Doubtful => {
+                    self.doubtful += 1;
+                    self.fate[row] = Fate::Needed;
+                    self.needed.push(row);
+                }
+                Outcome::Open => {
+                    let worst = self.worst_of_open(row);
+                    self.fate[worst] = Fate::Needed;
+                    self.needed.push(worst);
+                    self.touch(worst);
+                    if let Some(front) = &mut self.dominance {
+                        front.add(worst);
+                    }
+                }
+            }
+            if self.fate[row] != Fate::Open {
+                return;
+            }
+        }
+    }
+
+    /// The nearest point to z_0 with a_row y = 1 + tolerance, no other row known yet.
+    fn begin(&mut self, row: usize) {
+        let zero = vec![0.0; self.cost.variables()];
+        self.active.reset(&self.cost, &zero);
+        self.reversed.copy_from_slice(self.polar.normal(row));
+        self.reversed.iter_mut().for_each(|a| *a = -*a);
+        self.active.enter(row, &self.reversed, -(1.0 + self.tolerance), usize::MAX);
+    }
+
+    /// Goes on until the needed rows are satisfied or exclude the row; `without` is left out.
+    fn against_needed(&mut self, row: usize, without: Option<usize>) -> Outcome {
+        let iterations_max = 60 * (self.cost.variables() + 5);
+        while let Some(worst) = self.worst_of_needed(without) {
+            let Self { active, polar, .. } = self;
+            match active.enter(worst, polar.normal(worst), 1.0, iterations_max) {
+                Entry::Active => {}
+                Entry::Infeasible => return self.certify(row, worst),
+                Entry::Stalled => return Outcome::Doubtful,
+            }
+            if !self.active.point().iter().all(|y| y.is_finite()) {
+                return Outcome::Doubtful;
+            }
+        }
+        Outcome::Open
+    }
+
+    /// The most violated row, among recent ones if there is any, else among all needed ones.
+    fn worst_of_needed(&mut self, without: Option<usize>) -> Option<usize> {
+        self.polar.pad(self.active.point(), &mut self.padded);
+        let worst_of = |list: &[usize]| {
+            let mut worst = (1.0 + TIE, None);
+            for &row in list.iter().filter(|&&row| Some(row) != without) {
+                let product = self.polar.product(row, &self.padded);
+                if product > worst.0 {
+                    worst = (product, Some(row));
+                }
+            }
+            worst.1
+        };
+        let worst = worst_of(&self.recent).or_else(|| worst_of(&self.needed))?;
+        self.touch(worst);
+        Some(worst)
+    }
+
+    /// The open row with the largest a_i y: the ray to y leaves the set through it. `row` itself
+    /// wins ties, and duplicates of it are removed by it later.
+    fn worst_of_open(&mut self, row: usize) -> usize {
+        self.polar.pad(self.active.point(), &mut self.padded);
+        let own = self.polar.product(row, &self.padded);
+        let mut worst = (own, row);
+        let mut tie = false;
+        for other in 0..self.candidates {
+            if self.fate[other] != Fate::Open || other == row {
+                continue;
+            }
+            let product = self.polar.product(other, &self.padded);
+            if product > worst.0 + TIE {
+                worst = (product, other);
+                tie = false;
+            } else if product >= worst.0 - TIE {
+                tie = true;
+            }
+        }
+        self.ties |= tie;
+        worst.1
+    }
+
+    /// Is the ray a certificate, by its own arithmetic? a_row = sum y_j a_j with y >= 0 and
+    /// sum y_j <= 1 + tolerance.
+    fn certify(&mut self, row: usize, last: usize) -> Outcome {
+        // The reversed row has weight w in the ray; the others are divided by it.
+        let mut own = 0.0;
+        let mut sum = 0.0;
+        let mut misfit = vec![0.0; self.cost.variables()];
+        for (other, weight) in self.active.ray().chain([(last, 1.0)]) {
+            if other == row {
+                own = weight;
+                continue;
+            }
+            sum += weight;
+            for (m, a) in misfit.iter_mut().zip(self.polar.normal(other)) {
+                *m += weight * a;
+            }
+        }
+        let size = misfit.iter().fold(0.0_f64, |a, m| a.max(m.abs()));
+        for (m, a) in misfit.iter_mut().zip(self.polar.normal(row)) {
+            *m -= own * a;
+        }
+        let misfit = misfit.iter().fold(0.0_f64, |a, m| a.max(m.abs()));
+        if !(own > 0.0 && misfit <= MISFIT_MAX * size && sum <= own * (1.0 + self.tolerance)) {
+            return Outcome::Doubtful;
+        }
+        self.outer_excess = self.outer_excess.max(sum / own - 1.0);
+        Outcome::Redundant
+    }
+
+    /// Puts a row at the end of the recent ones.
+    fn touch(&mut self, row: usize) {
+        if let Some(place) = self.recent.iter().position(|&other| other == row) {
+            self.recent.remove(place);
+        } else if self.recent.len() == RECENT_MAX {
+            self.recent.remove(0);
+        }
+        self.recent.push(row);
+    }
+
+    /// Where rows were met at once, each needed one must stand against the others again.
+    fn clean_up(&mut self, budget: Budget<'_>) -> Result<(), Interruption> {
+        let mut place = 0;
+        while place < self.needed.len() {
+            let row = self.needed[place];
+            if row >= self.candidates {
+                place += 1;
+                continue;
+            }
+            budget.check()?;
+            self.begin(row);
+            if matches!(self.against_needed(row, Some(row)), Outcome::Redundant) {
+                self.fate[row] = Fate::Removed;
+                self.needed.remove(place);
+                self.recent.retain(|&other| other != row);
+            } else {
+                place += 1;
+            }
+        }
+        Ok(())
+    }
+}
