@@ -1,5 +1,6 @@
 //! The methods: one folder each, one trait, one list.
 
+pub mod abort_safe;
 pub mod disturbance_feedback;
 pub mod variable_horizon;
 mod verdict;

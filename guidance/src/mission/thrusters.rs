@@ -38,6 +38,13 @@ impl Thruster {
             .then(|| Self { direction: direction / length, force_max })
     }
 
+    /// A thruster whose direction has length 1 already, kept to the last bit, so that what is
+    /// written and read back is the same.
+    pub(crate) fn exactly(direction: Vector3<f64>, force_max: Force) -> Option<Self> {
+        let unit = (direction.norm() - 1.0).abs() < 1e-12;
+        Self::new(direction, force_max).filter(|_| unit).map(|_| Self { direction, force_max })
+    }
+
     /// Unit vector of the force on the chaser, RTN.
     #[must_use]
     pub fn direction(&self) -> &Vector3<f64> {

@@ -5,6 +5,7 @@ use std::ops::Range;
 use nalgebra::{DMatrix, SMatrix};
 
 use crate::{
+    bytes::{DecodeError, Reader, Writer},
     dynamics::{PeriodicPlant, RelativeVector, TransitionMatrix},
     matrices::product_fixed,
     sets::CentredEllipsoid,
@@ -103,6 +104,12 @@ impl EllipsoidUnion {
         Some(whole)
     }
 
+    /// Number of starts.
+    #[must_use]
+    pub fn starts(&self) -> usize {
+        self.starts
+    }
+
     /// Number of sets.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -184,6 +191,34 @@ impl EllipsoidUnion {
             self.nearest(k, x, count).into_iter().for_each(|set| keep_least(&mut near, count, set));
         }
         near
+    }
+
+    /// Appends the coefficients.
+    pub(crate) fn write(&self, writer: &mut Writer) {
+        writer.count(self.first);
+        writer.count(self.starts);
+        writer.count(self.instants);
+        writer.count(self.terms);
+        writer.numbers(&self.coefficients);
+    }
+
+    /// Reads what [`Self::write`] wrote, for so many starts from 0 and instants.
+    pub(crate) fn read(
+        reader: &mut Reader<'_>,
+        starts: usize,
+        instants: usize,
+    ) -> Result<Self, DecodeError> {
+        let union = Self {
+            first: reader.count()?,
+            starts: reader.count()?,
+            instants: reader.count()?,
+            terms: reader.count()?,
+            coefficients: reader.numbers()?,
+        };
+        let sizes = (union.first, union.starts, union.instants) == (0, starts, instants)
+            && [DECOUPLED, COUPLED].contains(&union.terms)
+            && union.coefficients.len() == starts * instants * union.terms;
+        if sizes { Ok(union) } else { Err(reader.fault("ellipsoids of another problem")) }
     }
 
     fn block(&self, k: usize) -> &[f64] {

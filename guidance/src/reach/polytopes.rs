@@ -5,6 +5,7 @@ use std::ops::Range;
 use nalgebra::{DMatrix, DVector, SMatrix, Vector3};
 
 use crate::{
+    bytes::{DecodeError, Reader, Writer},
     dynamics::{HeldStep, PeriodicPlant, RelativeVector},
     matrices::product_fixed,
     program::polytope_is_empty,
@@ -15,8 +16,8 @@ use crate::{
 /// from which the craft is in the polytope at that instant *whatever* its working thrusters do:
 /// {x : H_j x <= l_j}. [AguilarMarsillach2022, eqs. 20, 21]
 ///
-/// The normals are the same for all modes; only offsets differ. No row is ever redundant by
-/// construction of the recursion, and none is looked for: a box keeps its 12 rows.
+/// The normals are the same for all modes; only offsets differ. Rows that others imply are kept:
+/// a box has 12 rows for ever, and offsets can be compared set by set.
 ///
 /// Being in one of these sets is "there is an instant such that for all thrusts"; being unable to
 /// abort is "for all thrusts there is an instant". The first implies the second, and not the other
@@ -104,6 +105,12 @@ impl PolytopeUnion {
         Some(whole)
     }
 
+    /// Number of starts.
+    #[must_use]
+    pub fn starts(&self) -> usize {
+        self.starts.len()
+    }
+
     /// Number of sets that are not empty.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -137,6 +144,53 @@ impl PolytopeUnion {
             normals: &start.normals[place * self.rows * 6..][..self.rows * 6],
             offsets: &start.offsets[i * self.rows..][..self.rows],
         })
+    }
+
+    /// Appends the sets.
+    pub(crate) fn write(&self, writer: &mut Writer) {
+        writer.count(self.first);
+        writer.count(self.rows);
+        writer.count(self.modes);
+        writer.count(self.starts.len());
+        for start in &self.starts {
+            writer.small_counts(&start.kept);
+            writer.count(start.sets.len());
+            start.sets.iter().for_each(|&(place, mode)| writer.small_counts(&[place, mode]));
+            writer.numbers(&start.normals);
+            writer.numbers(&start.offsets);
+        }
+    }
+
+    /// Reads what [`Self::write`] wrote, for so many starts from 0, modes and instants.
+    pub(crate) fn read(
+        reader: &mut Reader<'_>,
+        starts: usize,
+        modes: usize,
+        instants: usize,
+    ) -> Result<Self, DecodeError> {
+        let (first, rows) = (reader.count()?, reader.count()?);
+        let sizes = (first, reader.count()?, reader.count()?);
+        if sizes != (0, modes, starts) {
+            return Err(reader.fault("polytopes of another problem"));
+        }
+        let start = |reader: &mut Reader<'_>| -> Result<StartSets, DecodeError> {
+            let kept = reader.small_counts()?;
+            let count = reader.count()?;
+            let sets = (0..count)
+                .map(|_| match reader.small_counts()?[..] {
+                    [place, mode] if place < kept.len() && mode < modes => Ok((place, mode)),
+                    _ => Err(reader.fault("a set of no instant or mode")),
+                })
+                .collect::<Result<Vec<_>, _>>()?;
+            let found =
+                StartSets { normals: reader.numbers()?, kept, sets, offsets: reader.numbers()? };
+            let fits = found.normals.len() == found.kept.len() * rows * 6
+                && found.offsets.len() == found.sets.len() * rows
+                && found.kept.iter().all(|&instant| instant < instants);
+            if fits { Ok(found) } else { Err(reader.fault("sets of other sizes")) }
+        };
+        let starts = (0..starts).map(|_| start(reader)).collect::<Result<_, _>>()?;
+        Ok(Self { first, rows, modes, starts })
     }
 
     /// The `count` sets of start k in which `x` is deepest or to which it is nearest, by

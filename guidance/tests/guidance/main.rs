@@ -2,6 +2,7 @@
 
 #![allow(clippy::print_stdout, reason = "golden tests print what they checked")]
 
+mod abort_safe_loop;
 mod abort_safety;
 mod disturbance_feedback_golden;
 mod disturbance_feedback_laws;

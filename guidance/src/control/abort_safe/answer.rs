@@ -1,0 +1,169 @@
+//! What a step answers.
+
+use nalgebra::Vector3;
+
+use super::State;
+use crate::{
+    control::{Certificate, Infeasibility},
+    dynamics::RelativeVector,
+    frames::RelativeState,
+    mission::ThrustMode,
+    reach::{Abort, AbortVerdict, Closest, PassiveVerdict},
+    units::Seconds,
+};
+
+/// What was measured, and when.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measurement {
+    /// The state, RTN.
+    pub state: RelativeState,
+    /// Time since the mission's start; must equal the step's time.
+    pub elapsed: Option<Seconds>,
+    /// The thrusters that work; `None`: all.
+    pub working: Option<ThrustMode>,
+}
+
+/// One decided step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Step {
+    /// The step this answers, from 0.
+    pub index: usize,
+    /// The phase it was decided in.
+    pub phase: usize,
+    /// The decision.
+    pub verdict: Verdict,
+    /// To be handed to the next step.
+    pub next: State,
+    /// The predicted trajectory; `None` without a regulator's command.
+    pub trajectory: Option<Trajectory>,
+    /// The proof; `None` without a regulator's command.
+    pub certificate: Option<Certificate>,
+    /// What could be done if thrusters failed at the next sample; `None` in phases that avoid
+    /// nothing, and without a command.
+    pub safety: Option<StateVerdict>,
+    /// How it came about.
+    pub diagnostics: Diagnostics,
+}
+
+/// The decision.
+#[derive(Debug, Clone, PartialEq)]
+#[allow(clippy::large_enum_variant, reason = "one is made a call and never stored in bulk")]
+pub enum Verdict {
+    /// Do this.
+    Command(Command),
+    /// Leave, with this sequence.
+    Abort(AbortCommand),
+    /// The mission is complete.
+    Arrived(Arrival),
+    /// No command satisfies the problem.
+    Infeasible(Infeasibility),
+}
+
+/// What to do until the next step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Command {
+    /// Start since the mission's start.
+    pub elapsed: Seconds,
+    /// How long the force is held.
+    pub duration: Seconds,
+    /// Along RTN, newtons.
+    pub force_n: Vector3<f64>,
+    /// Predicted states that enter the forbidden side of a half-space, because no trajectory
+    /// keeps out of all: the promise of safety does not hold for this step.
+    pub softened: bool,
+}
+
+/// An abort.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AbortCommand {
+    /// Why.
+    pub reason: AbortReason,
+    /// Thrusters that it uses.
+    pub working: ThrustMode,
+    /// What to do.
+    pub abort: Abort,
+}
+
+/// Why a step answers with an abort.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AbortReason {
+    /// Thrusters have failed.
+    Failure,
+    /// The regulator's problem has no answer. [AguilarMarsillach2022, remark 6]
+    NoTrajectory,
+}
+
+/// The mission is complete.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Arrival {
+    /// Number of commands given.
+    pub completion_steps: usize,
+    /// Distance from the target, metres.
+    pub distance_m: f64,
+    /// Speed, metres per second.
+    pub speed_m_s: f64,
+}
+
+/// x_0 .. x_N under u_0 .. u_(N-1), metres, metres per second, newtons, RTN.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trajectory {
+    /// N + 1.
+    pub states: Vec<RelativeVector>,
+    /// N.
+    pub forces_n: Vec<Vector3<f64>>,
+}
+
+/// What could be done from a state if thrusters failed there.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StateVerdict {
+    /// Time index k of the state.
+    pub index: usize,
+    /// The state.
+    pub state: RelativeVector,
+    /// One a mode of the phase.
+    pub modes: Vec<ModeVerdict>,
+    /// What free drift does, for phases that avoid an ellipsoid passively; `None` else, and for a
+    /// chaser that is on no ellipse.
+    pub drift: Option<PassiveVerdict>,
+}
+
+/// What could be done with the thrusters that are left.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModeVerdict {
+    /// Thrusters that still work.
+    pub working: ThrustMode,
+    /// There is an instant at which the state is in the avoided set whatever is done.
+    pub inside_reachable_set: bool,
+    /// Whether an abort exists. Not the opposite of the above: outside every reachable set there
+    /// can still be no abort.
+    pub abort: AbortVerdict,
+}
+
+impl StateVerdict {
+    /// An abort was found for every mode.
+    #[must_use]
+    pub fn abort_always_exists(&self) -> bool {
+        self.modes.iter().all(|mode| matches!(mode.abort, AbortVerdict::Found(_)))
+    }
+}
+
+/// How a step came about.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Diagnostics {
+    /// Distance to the region of the phase, or to the target where there is none, metres.
+    pub distance_m: f64,
+    /// Half-spaces that predicted states had to keep out of.
+    pub cuts: usize,
+    /// Least clearance of the points that the half-spaces were made for; negative if one of them
+    /// was inside its set. Infinite without half-spaces.
+    pub least_clearance: f64,
+    /// Largest violation of a half-space; 0 unless softened.
+    pub violation: f64,
+    /// The closest moment of the predicted trajectory to the target, between samples too; `least`
+    /// is in square metres. `None` without a prediction.
+    pub closest: Option<Closest>,
+    /// Rows that entered or left the active set.
+    pub iterations: usize,
+    /// The general solver was needed.
+    pub by_general_solver: bool,
+}

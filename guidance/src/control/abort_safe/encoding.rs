@@ -1,0 +1,240 @@
+//! Canonical bytes of a problem: equal problems, equal bytes; also how artifacts keep them.
+
+use nalgebra::SMatrix;
+
+use super::{Fallback, Phase, Problem, Safety, SetTiming, Watch, Weights};
+use crate::{
+    bytes::{DecodeError, Reader, Writer},
+    frames::InertialAxes,
+    mission::{AvoidanceRegion, AvoidanceSet, ThrustMode, Thruster, Thrusters},
+    orbit::{KeplerOrbit, Orientation},
+    units::{Angle, Distance, Force, Mass, Seconds},
+};
+
+impl Problem {
+    /// Canonical bytes of the parsed values; their digest names the problem.
+    #[must_use]
+    pub fn canonical_bytes(&self) -> Vec<u8> {
+        let mut writer = Writer::default();
+        write_problem(&mut writer, self);
+        writer.finish()
+    }
+}
+
+pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
+    write_orbit(writer, &problem.orbit);
+    writer.number(problem.mass.kilograms());
+    writer.number(problem.sample_time.seconds());
+    writer.count(problem.steps_per_period);
+    writer.count(problem.thrusters.list().len());
+    for thruster in problem.thrusters.list() {
+        writer.vector3(thruster.direction());
+        writer.number(thruster.force_max().newtons());
+    }
+    writer.count(problem.phases.len());
+    problem.phases.iter().for_each(|phase| write_phase(writer, phase));
+    writer.count(problem.prediction_horizon);
+    writer.number(problem.clearance);
+    writer.tag(match problem.timing {
+        SetTiming::Timed => 1,
+        SetTiming::Untimed => 2,
+    });
+    writer.tag(match problem.fallback {
+        Fallback::Soften => 1,
+        Fallback::Abort => 2,
+    });
+    writer.number(problem.arrival.metres());
+    writer.number(problem.fastest_approach_m_s);
+    writer.count(problem.abort_programs_max);
+    writer.number(problem.abort_clearance);
+    writer.count(problem.steps_max);
+}
+
+pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeError> {
+    let orbit = read_orbit(reader)?;
+    let mass = Mass::from_kilograms(reader.number()?);
+    let sample_time = Seconds::from_seconds(reader.number()?);
+    let steps_per_period = reader.count()?;
+    let count = reader.count()?;
+    let thruster = |reader: &mut Reader<'_>| -> Result<Thruster, DecodeError> {
+        let (direction, force) = (reader.vector3()?, Force::from_newtons(reader.number()?));
+        Thruster::exactly(direction, force).ok_or_else(|| reader.fault("no such thruster"))
+    };
+    let list = (0..count).map(|_| thruster(reader)).collect::<Result<Vec<_>, _>>()?;
+    let thrusters = Thrusters::new(list).ok_or_else(|| reader.fault("number of thrusters"))?;
+    let count = reader.count()?;
+    let phases = (0..count).map(|_| read_phase(reader)).collect::<Result<_, _>>()?;
+    let prediction_horizon = reader.count()?;
+    let clearance = reader.number()?;
+    let timing = match reader.tag()? {
+        1 => SetTiming::Timed,
+        2 => SetTiming::Untimed,
+        other => return Err(unknown(reader, "timing", other)),
+    };
+    let fallback = match reader.tag()? {
+        1 => Fallback::Soften,
+        2 => Fallback::Abort,
+        other => return Err(unknown(reader, "fallback", other)),
+    };
+    Ok(Problem {
+        orbit,
+        mass,
+        sample_time,
+        steps_per_period,
+        thrusters,
+        phases,
+        prediction_horizon,
+        clearance,
+        timing,
+        fallback,
+        arrival: Distance::from_metres(reader.number()?),
+        fastest_approach_m_s: reader.number()?,
+        abort_programs_max: reader.count()?,
+        abort_clearance: reader.number()?,
+        steps_max: reader.count()?,
+    })
+}
+
+fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
+    reader.fault(format!("{what} {tag} is not known"))
+}
+
+fn write_orbit(writer: &mut Writer, orbit: &KeplerOrbit) {
+    writer.number(orbit.semi_major_axis().metres());
+    writer.number(orbit.eccentricity());
+    writer.number(orbit.true_anomaly().radians());
+    writer.option(orbit.orientation(), |writer, orientation| {
+        writer.number(orientation.inclination.radians());
+        writer.number(orientation.raan.radians());
+        writer.number(orientation.argument_of_perigee.radians());
+        writer.tag(match orientation.axes {
+            InertialAxes::Eme2000 => 1,
+            InertialAxes::Teme => 2,
+            InertialAxes::Gcrf => 3,
+        });
+    });
+}
+
+fn read_orbit(reader: &mut Reader<'_>) -> Result<KeplerOrbit, DecodeError> {
+    let axis = Distance::from_metres(reader.number()?);
+    let eccentricity = reader.number()?;
+    let anomaly = Angle::from_radians(reader.number()?);
+    let orientation = reader.option(|reader| {
+        let angles = [reader.number()?, reader.number()?, reader.number()?];
+        let [inclination, raan, argument_of_perigee] = angles.map(Angle::from_radians);
+        let axes = match reader.tag()? {
+            1 => InertialAxes::Eme2000,
+            2 => InertialAxes::Teme,
+            3 => InertialAxes::Gcrf,
+            other => return Err(unknown(reader, "inertial axes", other)),
+        };
+        Ok(Orientation { inclination, raan, argument_of_perigee, axes })
+    })?;
+    KeplerOrbit::new(axis, eccentricity, anomaly, orientation)
+        .map_err(|error| reader.fault(error.to_string()))
+}
+
+fn write_phase(writer: &mut Writer, phase: &Phase) {
+    match &phase.safety {
+        Safety::Passive(watch) => {
+            writer.tag(1);
+            write_watch(writer, watch);
+        }
+        Safety::Active { watch, modes } => {
+            writer.tag(2);
+            write_watch(writer, watch);
+            writer.count(modes.len());
+            modes.iter().for_each(|mode| writer.count(mode.bits() as usize));
+        }
+        Safety::None => writer.tag(3),
+    }
+    phase.weights.stage.iter().for_each(|&x| writer.number(x));
+    phase.weights.input.iter().for_each(|&x| writer.number(x));
+    phase.weights.terminal.iter().for_each(|&x| writer.number(x));
+    writer.number(phase.advance_within.metres());
+}
+
+fn read_phase(reader: &mut Reader<'_>) -> Result<Phase, DecodeError> {
+    let safety = match reader.tag()? {
+        1 => Safety::Passive(read_watch(reader)?),
+        2 => {
+            let watch = read_watch(reader)?;
+            let count = reader.count()?;
+            let mode = |reader: &mut Reader<'_>| -> Result<ThrustMode, DecodeError> {
+                let bits = u32::try_from(reader.count()?);
+                bits.map(ThrustMode::from_bits).map_err(|_| reader.fault("no such mode"))
+            };
+            let modes = (0..count).map(|_| mode(reader)).collect::<Result<_, _>>()?;
+            Safety::Active { watch, modes }
+        }
+        3 => Safety::None,
+        other => return Err(unknown(reader, "safety", other)),
+    };
+    let weights = Weights {
+        stage: read_fixed(reader)?,
+        input: read_fixed(reader)?,
+        terminal: read_fixed(reader)?,
+    };
+    Ok(Phase { safety, weights, advance_within: Distance::from_metres(reader.number()?) })
+}
+
+fn read_fixed<const R: usize, const C: usize>(
+    reader: &mut Reader<'_>,
+) -> Result<SMatrix<f64, R, C>, DecodeError> {
+    let mut matrix = SMatrix::<f64, R, C>::zeros();
+    for x in matrix.iter_mut() {
+        *x = reader.number()?;
+    }
+    Ok(matrix)
+}
+
+fn write_watch(writer: &mut Writer, watch: &Watch) {
+    match watch.avoid.region() {
+        AvoidanceRegion::SemiAxes(axes) => {
+            writer.tag(1);
+            writer.vector3(axes);
+        }
+        AvoidanceRegion::Radius(radius) => {
+            writer.tag(2);
+            writer.number(*radius);
+        }
+        AvoidanceRegion::ShapeMatrix(shape) => {
+            writer.tag(3);
+            shape.iter().for_each(|&x| writer.number(x));
+        }
+        AvoidanceRegion::HalfWidths(widths) => {
+            writer.tag(4);
+            writer.vector3(widths);
+        }
+        AvoidanceRegion::Faces { normals, offsets } => {
+            writer.tag(5);
+            writer.matrix(normals);
+            writer.numbers(offsets.as_slice());
+        }
+    }
+    writer.number(watch.avoid.speed_max_m_s());
+    writer.number(watch.inflation);
+    writer.count(watch.horizon);
+    writer.count(watch.fractions);
+    writer.count(watch.nearest);
+}
+
+fn read_watch(reader: &mut Reader<'_>) -> Result<Watch, DecodeError> {
+    let region = match reader.tag()? {
+        1 => AvoidanceRegion::SemiAxes(reader.vector3()?),
+        2 => AvoidanceRegion::Radius(reader.number()?),
+        3 => AvoidanceRegion::ShapeMatrix(read_fixed::<3, 3>(reader)?),
+        4 => AvoidanceRegion::HalfWidths(reader.vector3()?),
+        5 => AvoidanceRegion::Faces { normals: reader.matrix()?, offsets: reader.vector()? },
+        other => return Err(unknown(reader, "region", other)),
+    };
+    let avoid = AvoidanceSet::new(region, reader.number()?)
+        .ok_or_else(|| reader.fault("a region that is not one"))?;
+    Ok(Watch {
+        avoid,
+        inflation: reader.number()?,
+        horizon: reader.count()?,
+        fractions: reader.count()?,
+        nearest: reader.count()?,
+    })
+}

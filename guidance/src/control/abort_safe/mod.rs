@@ -1,0 +1,110 @@
+//! Rendezvous that can be aborted at every step, on elliptic orbits.
+//!
+//! # What it does
+//! Drives a chaser towards a target in phases. In each phase it keeps the predicted states out of
+//! the states from which, if thrusters failed there, a region around the target would be entered:
+//! first the approach ellipsoid and the keep-out sphere under total failure, then a terminal
+//! region under failure of some thrusters, then nothing.
+//!
+//! # Symbols
+//! x relative state, u force, k step, k_p steps of a period, N_p prediction horizon, N safety
+//! horizon, S avoided set, U_i forces of mode i, RS backward reachable set, gamma inflation, rho
+//! clearance, l sets that each predicted state is kept out of.
+//!
+//! # Offline
+//! [`Artifact`]: the plant sampled along the orbit, and for every start along it the backward
+//! reachable sets of each phase; ellipsoids as 13 numbers each, polytopes with shared normals.
+//!
+//! # Online
+//! [`AbortSafe::step`](Controller::step): for each predicted state of the last step the l nearest
+//! sets of its own time index, one half-space off each, and a quadratic program (23). The answer
+//! says of the next state, for every failure, whether an abort exists, and gives one.
+//!
+//! # Guarantee and its assumptions
+//! A state outside the passive sets of its time index drifts clear of S at the instants of the
+//! safety horizon, as the linear plant has it; what happens between instants and without
+//! linearisation is reported beside it. For failures of some thrusters nothing follows from being
+//! outside the sets: there the verdict on each mode is what counts, found by exact search. Only
+//! the l nearest sets are cut off, so the next state is judged against all of them.
+//!
+//! # Where we differ from the paper
+//! - Proposition III.1 fails for active modes: a set is "there is an instant such that for all
+//!   thrusts", the lack of an abort "for all thrusts there is an instant". Both are reported.
+//! - Sets are timed: only those that start at a state's own time index threaten it. The union
+//!   (12) makes the paper's own start infeasible; it is an option.
+//! - (5) has lost the dots on two velocities; (31) and (32d) need Q^(1/2) a; (33) needs v_m^2;
+//!   the tangent of remark 5 has no factor 2.
+//! - One half-space for each set: a common one (28), (32) rarely exists for several sets. Where
+//!   (28) has no bound, because the origin is outside the set, the Euclidean projection is used.
+//! - Sets are ranked by gauge, not by a distance that adds metres to metres per second.
+//! - gamma inflates S before it is propagated, not the propagated offsets.
+//! - Phases advance by the distance of the position to the region, and never go back.
+//!
+//! # References
+//! \[AguilarMarsillach2022\].
+
+mod answer;
+mod artifact;
+mod encoding;
+mod problem;
+mod safety;
+mod state;
+mod step;
+
+pub use answer::{
+    AbortCommand, AbortReason, Arrival, Command, Diagnostics, Measurement, ModeVerdict,
+    StateVerdict, Step, Trajectory, Verdict,
+};
+pub use artifact::{Artifact, PhaseSummary, Shard, Summary};
+pub use problem::{Fallback, Phase, Problem, Safety, SetTiming, Watch, Weights};
+pub use safety::safety_report;
+pub use state::State;
+
+use super::{Controller, PrepareError, StepError};
+use crate::budget::Budget;
+
+/// Version of the mathematics: raised when the same problem can give different bytes.
+pub const VERSION: &str = "1";
+
+/// The method, as a [`Controller`].
+#[derive(Debug, Clone, Copy)]
+pub struct AbortSafe;
+
+impl Controller for AbortSafe {
+    type Problem = Problem;
+    type Shard = Shard;
+    type Artifact = Artifact;
+    type State = State;
+    type Measurement = Measurement;
+    type Answer = Step;
+
+    fn shards(problem: &Problem) -> usize {
+        artifact::shard_count(problem)
+    }
+
+    fn run_shard(
+        problem: &Problem,
+        shard: usize,
+        budget: Budget<'_>,
+    ) -> Result<Shard, PrepareError> {
+        budget.check()?;
+        artifact::run_shard(problem, shard)
+    }
+
+    fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+        artifact::merge(problem, shards)
+    }
+
+    fn start(_artifact: &Artifact) -> State {
+        State::START
+    }
+
+    fn step(
+        artifact: &Artifact,
+        state: &State,
+        measurement: &Measurement,
+        budget: Budget<'_>,
+    ) -> Result<Step, StepError> {
+        step::step(artifact, state, measurement, budget)
+    }
+}
