@@ -1,5 +1,6 @@
 //! The methods: one folder each, one trait, one list.
 
+pub mod offline_sampling;
 pub mod variable_horizon;
 mod verdict;
 

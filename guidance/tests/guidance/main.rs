@@ -6,6 +6,7 @@ mod golden;
 mod golden_offline_sampling;
 mod growth;
 mod laws;
+mod offline_sampling;
 mod quadratic;
 mod redundancy;
 mod scenario;
