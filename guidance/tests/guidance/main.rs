@@ -11,6 +11,7 @@ mod golden_abort_safe;
 mod golden_offline_sampling;
 mod growth;
 mod laws;
+mod offline_sampling;
 mod orbital_motion;
 mod quadratic;
 mod redundancy;

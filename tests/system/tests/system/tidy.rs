@@ -147,6 +147,18 @@ fn method_without_one_of_its_places_is_found() {
 }
 
 #[test]
+fn method_not_yet_served_is_there_and_not_served() {
+    const LIST: &str = "guidance/src/control/mod.rs";
+    const FOLDER: (&str, &str) = ("guidance/src/control/to_come/mod.rs", "");
+    const WAITING: &str = "enum Method {} const NOT_YET_SERVED: [&str; 1] = [\"to_come\"];";
+    accepts(methods, &[(LIST, WAITING), FOLDER]);
+    finds(methods, &[(LIST, WAITING)], &["to_come", "not there either"]);
+    let both = WAITING.replace("{}", "{ ToCome }");
+    let faults = methods(&Tree::of(&[(LIST, &both), FOLDER]));
+    assert!(faults.iter().any(|fault| fault.contains("at once")), "{faults:?}");
+}
+
+#[test]
 fn citation_unlisted_or_unused_is_found() {
     accepts(citations, &[FRONT]);
     let cites = ("guidance/src/sets/mod.rs", "/// Outer. [Jones2001b, eq. 3]");

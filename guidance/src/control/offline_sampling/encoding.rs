@@ -1,0 +1,314 @@
+//! Canonical bytes of a problem: equal problems, equal bytes; also how artifacts keep them.
+
+use super::{CostWeights, GainChoice, Problem, Redundancy, SampleChoice, Summary};
+use crate::{
+    bytes::{DecodeError, Reader, Writer},
+    dynamics::{Discretisation, MatrixPolynomial, Monomial, PlantMatrices, UncertainPlant},
+    reach::{GrowthLimits, HalfSpaces, InvariantLimits, StageFamily, StageGroup},
+    sampling::ScalarLaw,
+    sets::Polytope,
+};
+
+impl Problem {
+    /// Canonical bytes of the parsed values; their digest names the problem.
+    #[must_use]
+    pub fn canonical_bytes(&self) -> Vec<u8> {
+        let mut writer = Writer::default();
+        write_problem(&mut writer, self);
+        writer.finish()
+    }
+}
+
+pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
+    write_plant(writer, &problem.plant);
+    writer.option(problem.vertices.as_ref(), |writer, vertices| {
+        writer.count(vertices.len());
+        for vertex in vertices {
+            writer.matrix(&vertex.a);
+            writer.matrix(&vertex.b);
+            writer.matrix(&vertex.b_w);
+        }
+    });
+    write_laws(writer, &problem.disturbance);
+    writer.count(problem.horizon);
+    match &problem.gain {
+        GainChoice::Explicit(gain) => {
+            writer.tag(1);
+            writer.matrix(gain);
+        }
+        GainChoice::Lqr { state, input } => {
+            writer.tag(2);
+            writer.matrix(state);
+            writer.matrix(input);
+        }
+    }
+    writer.matrix(&problem.weights.state);
+    writer.matrix(&problem.weights.input);
+    writer.count(problem.weights.samples);
+    for set in [&problem.state_set, &problem.input_set] {
+        writer.matrix(set.normals());
+        writer.numbers(set.offsets().as_slice());
+    }
+    writer.number(problem.samples.violation);
+    writer.number(problem.samples.confidence_complement);
+    writer.option(problem.samples.variables, Writer::count);
+    writer.option(problem.samples.size, Writer::count);
+    writer.tag(u8::from(problem.samples.state_at_start));
+    match problem.redundancy {
+        Redundancy::Exact => writer.tag(1),
+        Redundancy::InnerScaled { epsilon } => {
+            writer.tag(2);
+            writer.number(epsilon);
+        }
+    }
+    writer.count(problem.terminal_limits.iterations_max);
+    writer.count(problem.terminal_limits.rows_max);
+    writer.count(problem.growth.rounds);
+    writer.count(problem.growth.directions);
+    writer.count(problem.growth.facets_max);
+    writer.bytes(&problem.seed.to_le_bytes());
+}
+
+pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeError> {
+    let plant = read_plant(reader)?;
+    let vertices = reader.option(|reader| {
+        let count = reader.count()?;
+        let vertex = |reader: &mut Reader<'_>| -> Result<PlantMatrices, DecodeError> {
+            Ok(PlantMatrices { a: reader.matrix()?, b: reader.matrix()?, b_w: reader.matrix()? })
+        };
+        (0..count).map(|_| vertex(reader)).collect()
+    })?;
+    let disturbance = read_laws(reader)?;
+    let horizon = reader.count()?;
+    let gain = match reader.tag()? {
+        1 => GainChoice::Explicit(reader.matrix()?),
+        2 => GainChoice::Lqr { state: reader.matrix()?, input: reader.matrix()? },
+        other => return Err(unknown(reader, "gain", other)),
+    };
+    let weights =
+        CostWeights { state: reader.matrix()?, input: reader.matrix()?, samples: reader.count()? };
+    let polytope = |reader: &mut Reader<'_>| -> Result<Polytope, DecodeError> {
+        let (normals, offsets) = (reader.matrix()?, reader.vector()?);
+        if normals.nrows() != offsets.len() {
+            return Err(reader.fault("rows of a polytope do not match"));
+        }
+        Ok(Polytope::new(normals, offsets))
+    };
+    let (state_set, input_set) = (polytope(reader)?, polytope(reader)?);
+    let samples = SampleChoice {
+        violation: reader.number()?,
+        confidence_complement: reader.number()?,
+        variables: reader.option(Reader::count)?,
+        size: reader.option(Reader::count)?,
+        state_at_start: read_flag(reader)?,
+    };
+    let redundancy = match reader.tag()? {
+        1 => Redundancy::Exact,
+        2 => Redundancy::InnerScaled { epsilon: reader.number()? },
+        other => return Err(unknown(reader, "redundancy", other)),
+    };
+    Ok(Problem {
+        plant,
+        vertices,
+        disturbance,
+        horizon,
+        gain,
+        weights,
+        state_set,
+        input_set,
+        samples,
+        redundancy,
+        terminal_limits: InvariantLimits {
+            iterations_max: reader.count()?,
+            rows_max: reader.count()?,
+        },
+        growth: GrowthLimits {
+            rounds: reader.count()?,
+            directions: reader.count()?,
+            facets_max: reader.count()?,
+        },
+        seed: read_seed(reader)?,
+    })
+}
+
+pub(super) fn write_summary(writer: &mut Writer, summary: &Summary) {
+    writer.matrix(&summary.gain);
+    writer.matrix(&summary.terminal_weight);
+    for count in [
+        summary.terminal_rows,
+        summary.samples,
+        summary.sampled_rows,
+        summary.kept_rows,
+        summary.doubtful_rows,
+        summary.first_step_rows,
+    ] {
+        writer.count(count);
+    }
+    writer.number(summary.outer_excess);
+    writer.tag(u8::from(summary.first_step_limited));
+    writer.option(summary.joint_confidence, Writer::number);
+}
+
+pub(super) fn read_summary(reader: &mut Reader<'_>) -> Result<Summary, DecodeError> {
+    Ok(Summary {
+        gain: reader.matrix()?,
+        terminal_weight: reader.matrix()?,
+        terminal_rows: reader.count()?,
+        samples: reader.count()?,
+        sampled_rows: reader.count()?,
+        kept_rows: reader.count()?,
+        doubtful_rows: reader.count()?,
+        first_step_rows: reader.count()?,
+        outer_excess: reader.number()?,
+        first_step_limited: read_flag(reader)?,
+        joint_confidence: reader.option(Reader::number)?,
+    })
+}
+
+pub(super) fn write_half_spaces(writer: &mut Writer, rows: &HalfSpaces) {
+    writer.count(rows.dimension());
+    writer.numbers(rows.offsets());
+    for row in 0..rows.len() {
+        rows.normal(row).iter().for_each(|&entry| writer.number(entry));
+    }
+}
+
+pub(super) fn read_half_spaces(reader: &mut Reader<'_>) -> Result<HalfSpaces, DecodeError> {
+    let dimension = reader.count()?;
+    if dimension > 100_000 {
+        return Err(reader.fault("too many coordinates"));
+    }
+    let offsets = reader.numbers()?;
+    let mut rows = HalfSpaces::new(dimension);
+    for offset in offsets {
+        let normal: Vec<f64> = (0..dimension).map(|_| reader.number()).collect::<Result<_, _>>()?;
+        rows.push(&normal, offset);
+    }
+    Ok(rows)
+}
+
+pub(super) fn write_origin(writer: &mut Writer, origin: Option<StageGroup>) {
+    let Some(group) = origin else { return writer.tag(0) };
+    writer.tag(match group.family {
+        StageFamily::State => 1,
+        StageFamily::Input => 2,
+        StageFamily::Terminal => 3,
+    });
+    writer.count(group.stage);
+}
+
+pub(super) fn read_origin(reader: &mut Reader<'_>) -> Result<Option<StageGroup>, DecodeError> {
+    let family = match reader.tag()? {
+        0 => return Ok(None),
+        1 => StageFamily::State,
+        2 => StageFamily::Input,
+        3 => StageFamily::Terminal,
+        other => return Err(unknown(reader, "origin", other)),
+    };
+    Ok(Some(StageGroup { family, stage: reader.count()? }))
+}
+
+fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
+    reader.fault(format!("{what} {tag} is not known"))
+}
+
+fn read_flag(reader: &mut Reader<'_>) -> Result<bool, DecodeError> {
+    match reader.tag()? {
+        0 => Ok(false),
+        1 => Ok(true),
+        other => Err(unknown(reader, "flag", other)),
+    }
+}
+
+fn read_seed(reader: &mut Reader<'_>) -> Result<u64, DecodeError> {
+    let bytes = <[u8; 8]>::try_from(reader.bytes()?);
+    bytes.map(u64::from_le_bytes).map_err(|_| reader.fault("a seed has eight bytes"))
+}
+
+fn write_plant(writer: &mut Writer, plant: &UncertainPlant) {
+    for polynomial in [&plant.a, &plant.b, &plant.b_w] {
+        writer.matrix(&polynomial.constant);
+        writer.count(polynomial.terms.len());
+        for term in &polynomial.terms {
+            writer.count(term.powers.len());
+            term.powers.iter().for_each(|&power| writer.count(power as usize));
+            writer.matrix(&term.matrix);
+        }
+    }
+    write_laws(writer, &plant.parameters);
+    match plant.discretisation {
+        Discretisation::None => writer.tag(1),
+        Discretisation::ZeroOrderHold { sample_time_s } => {
+            writer.tag(2);
+            writer.number(sample_time_s);
+        }
+        Discretisation::Euler { sample_time_s } => {
+            writer.tag(3);
+            writer.number(sample_time_s);
+        }
+    }
+}
+
+fn read_plant(reader: &mut Reader<'_>) -> Result<UncertainPlant, DecodeError> {
+    let polynomial = |reader: &mut Reader<'_>| -> Result<MatrixPolynomial, DecodeError> {
+        let constant = reader.matrix()?;
+        let count = reader.count()?;
+        let term = |reader: &mut Reader<'_>| -> Result<Monomial, DecodeError> {
+            let count = reader.count()?;
+            let power = |reader: &mut Reader<'_>| {
+                u32::try_from(reader.count()?).map_err(|_| reader.fault("power too large"))
+            };
+            let powers = (0..count).map(|_| power(reader)).collect::<Result<_, _>>()?;
+            Ok(Monomial { powers, matrix: reader.matrix()? })
+        };
+        let terms = (0..count).map(|_| term(reader)).collect::<Result<_, _>>()?;
+        Ok(MatrixPolynomial { constant, terms })
+    };
+    let (a, b, b_w) = (polynomial(reader)?, polynomial(reader)?, polynomial(reader)?);
+    let parameters = read_laws(reader)?;
+    let discretisation = match reader.tag()? {
+        1 => Discretisation::None,
+        2 => Discretisation::ZeroOrderHold { sample_time_s: reader.number()? },
+        3 => Discretisation::Euler { sample_time_s: reader.number()? },
+        other => return Err(unknown(reader, "discretisation", other)),
+    };
+    Ok(UncertainPlant { a, b, b_w, parameters, discretisation })
+}
+
+fn write_laws(writer: &mut Writer, laws: &[ScalarLaw]) {
+    writer.count(laws.len());
+    for law in laws {
+        match *law {
+            ScalarLaw::Constant(value) => {
+                writer.tag(1);
+                writer.number(value);
+            }
+            ScalarLaw::Uniform { low, high } => {
+                writer.tag(2);
+                writer.number(low);
+                writer.number(high);
+            }
+            ScalarLaw::TruncatedGaussian { deviation, bound } => {
+                writer.tag(3);
+                writer.number(deviation);
+                writer.number(bound);
+            }
+        }
+    }
+}
+
+fn read_laws(reader: &mut Reader<'_>) -> Result<Vec<ScalarLaw>, DecodeError> {
+    let count = reader.count()?;
+    let law = |reader: &mut Reader<'_>| -> Result<ScalarLaw, DecodeError> {
+        Ok(match reader.tag()? {
+            1 => ScalarLaw::Constant(reader.number()?),
+            2 => ScalarLaw::Uniform { low: reader.number()?, high: reader.number()? },
+            3 => ScalarLaw::TruncatedGaussian {
+                deviation: reader.number()?,
+                bound: reader.number()?,
+            },
+            other => return Err(unknown(reader, "law", other)),
+        })
+    };
+    (0..count).map(|_| law(reader)).collect()
+}

@@ -1,0 +1,100 @@
+//! Stochastic MPC whose chance constraints are sampled offline.
+//!
+//! # What it does
+//! Drives a linear plant with uncertain matrices and bounded random disturbance to the origin of
+//! its coordinates (the target), so that each state constraint holds with a chosen probability
+//! and the input constraints always.
+//!
+//! # Symbols
+//! x state, u = K x + v input, v correction, w disturbance, q parameters; T horizon; Q, R, P
+//! weights; H_x, H_u, H_T constraints; epsilon violation, delta complement of the confidence;
+//! D the sampled set over (x, v), D_R the first-step set.
+//!
+//! # Offline
+//! K, the terminal set (the largest robust invariant one under K), P, the expected cost; then a
+//! row of D for every sample and constraint, group by group ([`Controller::run_shard`]), without
+//! redundant ones; then a robust control invariant set grown from the terminal set, and D_R: every
+//! successor lies in it.
+//!
+//! # Online
+//! [`Controller::step`]: one dense quadratic program over the corrections, u = K x + v_0.
+//!
+//! # Guarantee and its assumptions
+//! If the plants lie in the hull of the vertices and w in its bounds: from a state in the first-
+//! step set every later step has an answer; the input constraints hold; each state constraint
+//! holds with probability 1 - epsilon, with confidence 1 - delta for each sampled group, and all
+//! groups together with the confidence that the artifact states. Where no answer exists all the
+//! same, the last plan's tail is flown, clipped, and flagged: it carries no guarantee.
+//!
+//! # Where we differ from the paper
+//! - The constant in z = (x, v, 1) replaces the printed blocks of (7) and appendix A.
+//! - State rows of stage 0 are left out unless asked for: they are data, and turn the chance
+//!   constraint robust.
+//! - C_T is not projected from n + T m dimensions: the first-step set is grown from inside.
+//! - Exact removal of redundant rows, or scaled inner sets: removing nearly redundant rows alone
+//!   would leave an outer set, with violations.
+//!
+//! # References
+//! \[Mammarella2019\].
+
+mod artifact;
+mod design;
+mod encoding;
+mod problem;
+mod state;
+mod step;
+
+pub use artifact::{Artifact, Summary};
+pub use design::Shard;
+pub use problem::{CostWeights, GainChoice, Problem, Redundancy, SampleChoice};
+pub use state::State;
+pub use step::{Branch, Command, Diagnostics, Measurement, Step, Verdict};
+
+use super::{Controller, PrepareError, StepError};
+use crate::budget::Budget;
+
+/// Version of the mathematics: raised when the same problem can give different bytes.
+pub const VERSION: &str = "1";
+
+/// The method, as a [`Controller`].
+#[derive(Debug, Clone, Copy)]
+pub struct OfflineSampling;
+
+impl Controller for OfflineSampling {
+    type Problem = Problem;
+    type Shard = Shard;
+    type Artifact = Artifact;
+    type State = State;
+    type Measurement = Measurement;
+    type Answer = Step;
+
+    /// One a sampled group, and one for the expected cost.
+    fn shards(problem: &Problem) -> usize {
+        problem.groups().len() + 1
+    }
+
+    fn run_shard(
+        problem: &Problem,
+        shard: usize,
+        budget: Budget<'_>,
+    ) -> Result<Shard, PrepareError> {
+        design::run_shard(problem, shard, budget)
+    }
+
+    fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+        design::merge(problem, &shards)
+    }
+
+    fn start(_artifact: &Artifact) -> State {
+        State::START
+    }
+
+    fn step(
+        artifact: &Artifact,
+        state: &State,
+        measurement: &Measurement,
+        budget: Budget<'_>,
+    ) -> Result<Step, StepError> {
+        step::step(artifact, state, measurement, budget)
+    }
+}
