@@ -279,7 +279,19 @@ mod tests {
         let a = DMatrix::from_row_slice(2, 2, &[1.0, 1.0, 0.0, 1.0]);
         let b = DMatrix::from_row_slice(2, 1, &[0.5, 1.0]);
         check(&a, &b, Some(12));
-        let (a, b) = crate::dynamics::clohessy_wiltshire(0.1);
+        // Relative motion over a tenth of a radian, impulses as input.
+        let t = 0.1;
+        let (s, c) = (libm::sin(t), libm::cos(t));
+        #[rustfmt::skip]
+        let a = DMatrix::from_row_slice(6, 6, &[
+            4.0 - 3.0 * c, 0.0, 0.0, s, 2.0 * (1.0 - c), 0.0,
+            6.0 * (s - t), 1.0, 0.0, 2.0 * (c - 1.0), 4.0 * s - 3.0 * t, 0.0,
+            0.0, 0.0, c, 0.0, 0.0, s,
+            3.0 * s, 0.0, 0.0, c, 2.0 * s, 0.0,
+            6.0 * (c - 1.0), 0.0, 0.0, -2.0 * s, 4.0 * c - 3.0, 0.0,
+            0.0, 0.0, -s, 0.0, 0.0, c,
+        ]);
+        let b = a.columns(3, 3).into_owned();
         check(&a, &b, Some(12));
         // Several for one that forgets, and the plain recursion for one without an inverse.
         let a = DMatrix::from_row_slice(3, 3, &[0.2, 0.1, 0.0, -0.1, 0.3, 0.1, 0.0, 0.2, 0.15]);
