@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::{EARTH_MU_M3_S2, InertialState};
 use crate::{
+    bytes::{DecodeError, Reader, Writer},
     frames::{InFrame, InertialAxes},
     units::{Angle, Distance, Seconds},
 };
@@ -274,4 +275,43 @@ fn eccentric_from_mean(e: f64, mean: f64) -> f64 {
         eccentric = next;
     }
     eccentric
+}
+
+impl KeplerOrbit {
+    /// Writes the canonical bytes of the orbit: SI and radians, the orientation if there is one.
+    pub(crate) fn write(&self, writer: &mut Writer) {
+        writer.number(self.semi_major_axis().metres());
+        writer.number(self.eccentricity());
+        writer.number(self.true_anomaly().radians());
+        writer.option(self.orientation(), |writer, orientation| {
+            writer.number(orientation.inclination.radians());
+            writer.number(orientation.raan.radians());
+            writer.number(orientation.argument_of_perigee.radians());
+            writer.tag(match orientation.axes {
+                InertialAxes::Eme2000 => 1,
+                InertialAxes::Teme => 2,
+                InertialAxes::Gcrf => 3,
+            });
+        });
+    }
+
+    /// Reads and checks what [`KeplerOrbit::write`] wrote.
+    pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        let axis = Distance::from_metres(reader.number()?);
+        let eccentricity = reader.number()?;
+        let anomaly = Angle::from_radians(reader.number()?);
+        let orientation = reader.option(|reader| {
+            let angles = [reader.number()?, reader.number()?, reader.number()?];
+            let [inclination, raan, argument_of_perigee] = angles.map(Angle::from_radians);
+            let axes = match reader.tag()? {
+                1 => InertialAxes::Eme2000,
+                2 => InertialAxes::Teme,
+                3 => InertialAxes::Gcrf,
+                other => return Err(reader.fault(format!("inertial axes {other} is not known"))),
+            };
+            Ok(Orientation { inclination, raan, argument_of_perigee, axes })
+        })?;
+        Self::new(axis, eccentricity, anomaly, orientation)
+            .map_err(|error| reader.fault(error.to_string()))
+    }
 }

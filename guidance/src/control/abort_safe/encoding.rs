@@ -5,10 +5,9 @@ use nalgebra::SMatrix;
 use super::{Fallback, Phase, Problem, Safety, SetTiming, Watch, Weights};
 use crate::{
     bytes::{DecodeError, Reader, Writer},
-    frames::InertialAxes,
     mission::{AvoidanceRegion, AvoidanceSet, ThrustMode, Thruster, Thrusters},
-    orbit::{KeplerOrbit, Orientation},
-    units::{Angle, Distance, Force, Mass, Seconds},
+    orbit::KeplerOrbit,
+    units::{Distance, Force, Mass, Seconds},
 };
 
 impl Problem {
@@ -22,7 +21,7 @@ impl Problem {
 }
 
 pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
-    write_orbit(writer, &problem.orbit);
+    problem.orbit.write(writer);
     writer.number(problem.mass.kilograms());
     writer.number(problem.sample_time.seconds());
     writer.count(problem.steps_per_period);
@@ -51,7 +50,7 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
 }
 
 pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeError> {
-    let orbit = read_orbit(reader)?;
+    let orbit = KeplerOrbit::read(reader)?;
     let mass = Mass::from_kilograms(reader.number()?);
     let sample_time = Seconds::from_seconds(reader.number()?);
     let steps_per_period = reader.count()?;
@@ -97,41 +96,6 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
 
 fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
     reader.fault(format!("{what} {tag} is not known"))
-}
-
-fn write_orbit(writer: &mut Writer, orbit: &KeplerOrbit) {
-    writer.number(orbit.semi_major_axis().metres());
-    writer.number(orbit.eccentricity());
-    writer.number(orbit.true_anomaly().radians());
-    writer.option(orbit.orientation(), |writer, orientation| {
-        writer.number(orientation.inclination.radians());
-        writer.number(orientation.raan.radians());
-        writer.number(orientation.argument_of_perigee.radians());
-        writer.tag(match orientation.axes {
-            InertialAxes::Eme2000 => 1,
-            InertialAxes::Teme => 2,
-            InertialAxes::Gcrf => 3,
-        });
-    });
-}
-
-fn read_orbit(reader: &mut Reader<'_>) -> Result<KeplerOrbit, DecodeError> {
-    let axis = Distance::from_metres(reader.number()?);
-    let eccentricity = reader.number()?;
-    let anomaly = Angle::from_radians(reader.number()?);
-    let orientation = reader.option(|reader| {
-        let angles = [reader.number()?, reader.number()?, reader.number()?];
-        let [inclination, raan, argument_of_perigee] = angles.map(Angle::from_radians);
-        let axes = match reader.tag()? {
-            1 => InertialAxes::Eme2000,
-            2 => InertialAxes::Teme,
-            3 => InertialAxes::Gcrf,
-            other => return Err(unknown(reader, "inertial axes", other)),
-        };
-        Ok(Orientation { inclination, raan, argument_of_perigee, axes })
-    })?;
-    KeplerOrbit::new(axis, eccentricity, anomaly, orientation)
-        .map_err(|error| reader.fault(error.to_string()))
 }
 
 fn write_phase(writer: &mut Writer, phase: &Phase) {

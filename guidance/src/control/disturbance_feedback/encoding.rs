@@ -4,10 +4,10 @@ use super::{ArrivalMetric, Instants, Problem};
 use crate::{
     bytes::{DecodeError, Reader, Writer},
     epoch::{Epoch, TimeSystem},
-    frames::{InFrame, InertialAxes, LvlhCcsds, RelativeState},
-    orbit::{KeplerOrbit, Orientation},
+    frames::{InFrame, LvlhCcsds, RelativeState},
+    orbit::KeplerOrbit,
     sets::{Ellipsoid, OuterSum},
-    units::{Angle, Distance, Seconds},
+    units::Seconds,
 };
 
 impl Problem {
@@ -32,7 +32,7 @@ impl Problem {
 }
 
 pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
-    write_orbit(writer, &problem.orbit);
+    problem.orbit.write(writer);
     writer.option(problem.epoch, write_epoch);
     write_state(writer, &problem.initial);
     write_state(writer, &problem.target_state);
@@ -55,7 +55,7 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
 }
 
 pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeError> {
-    let orbit = read_orbit(reader)?;
+    let orbit = KeplerOrbit::read(reader)?;
     let epoch = reader.option(read_epoch)?;
     let initial = read_state(reader)?;
     let target_state = read_state(reader)?;
@@ -107,41 +107,6 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
 
 fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
     reader.fault(format!("{what} {tag} is not known"))
-}
-
-fn write_orbit(writer: &mut Writer, orbit: &KeplerOrbit) {
-    writer.number(orbit.semi_major_axis().metres());
-    writer.number(orbit.eccentricity());
-    writer.number(orbit.true_anomaly().radians());
-    writer.option(orbit.orientation(), |writer, orientation| {
-        writer.number(orientation.inclination.radians());
-        writer.number(orientation.raan.radians());
-        writer.number(orientation.argument_of_perigee.radians());
-        writer.tag(match orientation.axes {
-            InertialAxes::Eme2000 => 1,
-            InertialAxes::Teme => 2,
-            InertialAxes::Gcrf => 3,
-        });
-    });
-}
-
-fn read_orbit(reader: &mut Reader<'_>) -> Result<KeplerOrbit, DecodeError> {
-    let semi_major_axis = Distance::from_metres(reader.number()?);
-    let eccentricity = reader.number()?;
-    let true_anomaly = Angle::from_radians(reader.number()?);
-    let orientation = reader.option(|reader| {
-        let mut angle = || reader.number().map(Angle::from_radians);
-        let (inclination, raan, argument_of_perigee) = (angle()?, angle()?, angle()?);
-        let axes = match reader.tag()? {
-            1 => InertialAxes::Eme2000,
-            2 => InertialAxes::Teme,
-            3 => InertialAxes::Gcrf,
-            other => return Err(unknown(reader, "inertial axes", other)),
-        };
-        Ok(Orientation { inclination, raan, argument_of_perigee, axes })
-    })?;
-    KeplerOrbit::new(semi_major_axis, eccentricity, true_anomaly, orientation)
-        .map_err(|fault| reader.fault(fault.to_string()))
 }
 
 fn write_epoch(writer: &mut Writer, epoch: Epoch) {
