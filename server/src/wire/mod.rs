@@ -24,8 +24,9 @@ pub(crate) use calls::{
 pub(crate) use controller_state::{ControllerState, StateFault};
 pub(crate) use disturbance_feedback::Claimed;
 pub(crate) use export::{Document, Missing, OcmBurn, OcmFault, Order, read_ocm_burns};
+use methods::Wired;
 pub(crate) use methods::{
-    Artifact, Candidate, PlanVerdict, Problem, SolverWork, State, Step, VerdictKind,
+    Artifact, Candidate, PlanVerdict, Planning, Problem, SolverWork, State, Step, VerdictKind,
 };
 pub(crate) use types::{ArtifactId, ElapsedAndState, Provenance};
 pub(crate) use vbar_guidance::control::disturbance_feedback::INSTANTS_MAX as PLAN_INSTANTS_MAX;
