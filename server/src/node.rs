@@ -100,7 +100,9 @@ impl Node {
             };
             // It reads what the store remembers, and may wait for a process that is just ending.
             let opened = tokio::task::spawn_blocking(open).await.map_err(io::Error::other);
-            opened.and_then(|opened| opened).map_err(|fault| StartError::Store(fault.to_string()))?
+            opened
+                .and_then(|opened| opened)
+                .map_err(|fault| StartError::Store(fault.to_string()))?
         };
         let service = Arc::new(service);
         let rest = config.artifact_lifetime.min(config.operation_lifetime) / 8;

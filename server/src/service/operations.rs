@@ -81,8 +81,8 @@ impl Work for Precompute {
         self.problem.run_shard(shard, budget).map_err(|fault| self.stopped(fault))
     }
 
-    fn finish(&self, shards: Vec<Shard>) -> Result<(), Stopped> {
-        let artifact = self.problem.merge(shards).map_err(|fault| self.stopped(fault))?;
+    fn finish(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<(), Stopped> {
+        let artifact = self.problem.merge(shards, budget).map_err(|fault| self.stopped(fault))?;
         let kept = self.shelves.keep(self.id, artifact);
         let kept = kept.map_err(|error| Stopped::Failed(error.into()))?;
         self.shelves.looked_up("computed");
@@ -103,24 +103,23 @@ pub(crate) struct Watching {
 }
 
 impl Watching {
-    /// The operation as it stands: at once, then after each change, at most one answer within
-    /// `pause`; `None` after it is done, or when `until` has come or the node ends.
+    /// The operation as it stands: at once, then after each change or a second, at most one answer
+    /// within `pause`; `None` after it is done, or when `until` has come or the node ends.
     pub(crate) async fn next(
         &mut self,
         is_first: bool,
         pause: Duration,
         until: Instant,
     ) -> Option<Result<OperationAnswer, Error>> {
+        const LOOK_AGAIN: Duration = Duration::from_secs(1);
         if self.is_over {
             return None;
         }
         if !is_first {
             tokio::select! {
-                changed = self.changes.changed() => {
-                    if changed.is_ok() {
-                        tokio::time::sleep(pause).await;
-                    }
-                }
+                _ = self.changes.changed() => tokio::time::sleep(pause).await,
+                // A shard tells nobody how far it is: it is looked at.
+                () = tokio::time::sleep(LOOK_AGAIN) => {}
                 () = tokio::time::sleep_until(until.into()) => return None,
                 () = self.service.jobs.closed() => return None,
             }

@@ -127,13 +127,12 @@ impl Render for Failure {
         };
         let mut details = vec![any(&info)];
         if !self.violations.is_empty() {
-            let field_violations = self.violations.iter().map(|violation| {
-                rpc::bad_request::FieldViolation {
+            let field_violations =
+                self.violations.iter().map(|violation| rpc::bad_request::FieldViolation {
                     field: violation.path.clone(),
                     description: violation.to_string(),
                     reason: "INVALID_VALUE".to_owned(),
-                }
-            });
+                });
             details.push(any(&rpc::BadRequest { field_violations: field_violations.collect() }));
         }
         rpc::Status { code: self.code, message: self.message.clone(), details }
@@ -212,6 +211,8 @@ pub(crate) struct Progress {
     pub(crate) shards_done: usize,
     /// At least 1.
     pub(crate) shards_total: usize,
+    /// Of everything, parts of shards included, while it is not done.
+    pub(crate) fraction: Option<f64>,
     pub(crate) attempts: u32,
     pub(crate) created: SystemTime,
     pub(crate) started: Option<SystemTime>,
@@ -231,26 +232,32 @@ impl Progress {
     }
 
     fn fraction_done(&self) -> f64 {
-        if self.standing == Standing::Succeeded {
-            return 1.0;
+        match (self.standing, self.fraction) {
+            (Standing::Succeeded, _) => 1.0,
+            (_, Some(fraction)) => fraction,
+            // The merge counts as one more shard.
+            (_, None) => {
+                f64::from(count(self.shards_done)) / f64::from(count(self.shards_total) + 1)
+            }
         }
-        f64::from(count(self.shards_done)) / f64::from(count(self.shards_total.max(1)))
+    }
+
+    /// How long it has run; at least the clock's tick.
+    fn run_time_s(&self) -> f64 {
+        let until = self.ended.unwrap_or(self.seen);
+        let running = self.started.and_then(|started| until.duration_since(started).ok());
+        running.unwrap_or_default().max(Duration::from_millis(1)).as_secs_f64()
     }
 
     /// Shards a second since it runs.
     fn rate(&self) -> f64 {
-        let running = self.started.and_then(|started| {
-            let until = self.ended.unwrap_or(self.seen);
-            until.duration_since(started).ok()
-        });
-        // The clock's tick is a millisecond, and a time of zero has no rate.
-        let seconds = running.unwrap_or_default().max(Duration::from_millis(1)).as_secs_f64();
-        f64::from(count(self.shards_done)) / seconds
+        f64::from(count(self.shards_done)) / self.run_time_s()
     }
 
     fn remaining_s(&self) -> Option<f64> {
-        let left = f64::from(count(self.shards_total.saturating_sub(self.shards_done)));
-        (self.standing == Standing::Running && self.shards_done > 0).then(|| left / self.rate())
+        let done = self.fraction_done();
+        let is_known = self.standing == Standing::Running && done > 0.0;
+        is_known.then(|| self.run_time_s() * (1.0 - done) / done)
     }
 }
 
@@ -534,7 +541,8 @@ mod tests {
             method: "variable_horizon".to_owned(),
             standing: Standing::Running,
             shards_done: 4,
-            shards_total: 16,
+            shards_total: 15,
+            fraction: Some(0.25),
             attempts: 1,
             created: at(90),
             started: Some(at(100)),
@@ -544,13 +552,21 @@ mod tests {
         let rendered = running.render();
         assert_eq!((rendered.fraction_done, rendered.shards_per_s), (0.25, 0.5));
         assert_eq!((rendered.remaining_s, rendered.phase.as_str()), (Some(24.0), "computing"));
-        let merging = Progress { shards_done: 16, ..running.clone() }.render();
-        assert_eq!((merging.remaining_s, merging.phase.as_str()), (Some(0.0), "merging"));
-        let fresh = Progress { shards_done: 0, ..running.clone() }.render();
+        let merging = Progress { shards_done: 15, ..running.clone() }.render();
+        assert_eq!(merging.phase, "merging");
+        let fresh = Progress { shards_done: 0, fraction: Some(0.0), ..running.clone() }.render();
         assert_eq!((fresh.remaining_s, fresh.shards_per_s), (None, 0.0));
-        let standing = Standing::Cancelled;
-        let ended = Progress { standing, ended: Some(at(108)), seen: at(999), ..running }.render();
-        assert_eq!((ended.shards_per_s, ended.fraction_done), (0.5, 0.25));
-        assert_eq!((ended.remaining_s, ended.phase.as_str()), (None, "done"));
+        let cancelled = Progress {
+            standing: Standing::Cancelled,
+            fraction: None,
+            ended: Some(at(108)),
+            seen: at(999),
+            ..running.clone()
+        };
+        let rendered = cancelled.render();
+        assert_eq!((rendered.shards_per_s, rendered.fraction_done), (0.5, 0.25));
+        assert_eq!((rendered.remaining_s, rendered.phase.as_str()), (None, "done"));
+        let made = Progress { standing: Standing::Succeeded, ..cancelled }.render();
+        assert_eq!(made.fraction_done, 1.0);
     }
 }

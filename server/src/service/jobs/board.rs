@@ -5,7 +5,7 @@ use std::{
     ops::Bound,
     sync::{
         Arc,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicU32, Ordering},
     },
     time::{Duration, Instant, SystemTime},
 };
@@ -51,6 +51,39 @@ struct Run<W: Work> {
     /// Shards taken so far; they are taken in order.
     taken: usize,
     shards: Shards<W>,
+    told: Arc<Told>,
+}
+
+/// How far each shard, and last the merge, says it is; millionths.
+#[derive(Debug)]
+pub(super) struct Told(Vec<AtomicU32>);
+
+impl Told {
+    const WHOLE: u32 = 1_000_000;
+
+    fn new(shards: usize) -> Self {
+        Self((0..=shards).map(|_| AtomicU32::new(0)).collect())
+    }
+
+    pub(super) fn shard(&self, shard: usize, progress: vbar_guidance::Progress) {
+        if let Some(part) = self.0.get(shard) {
+            let (done, total) = (progress.done as u64, progress.total.max(1) as u64);
+            let whole = u64::from(Self::WHOLE);
+            let millionths = (done.saturating_mul(whole) / total).min(whole);
+            // Of several phases the furthest counts: nobody likes a bar that goes back.
+            part.fetch_max(u32::try_from(millionths).unwrap_or(Self::WHOLE), Ordering::Relaxed);
+        }
+    }
+
+    pub(super) fn merge(&self, progress: vbar_guidance::Progress) {
+        self.shard(self.0.len() - 1, progress);
+    }
+
+    /// Of everything; the merge counts as one more shard.
+    fn fraction(&self) -> f64 {
+        let parts = self.0.iter().map(|part| u64::from(part.load(Ordering::Relaxed)));
+        parts.sum::<u64>() as f64 / (self.0.len() as f64 * f64::from(Self::WHOLE))
+    }
 }
 
 /// Shards that are done, each in its place.
@@ -72,6 +105,7 @@ pub(super) struct Turn<W: Work> {
     pub(super) work: Arc<W>,
     pub(super) run: RunKey,
     pub(super) shard: usize,
+    pub(super) told: Arc<Told>,
     pub(super) deadline: Instant,
     /// Nobody took a shard of this run before.
     pub(super) is_first: bool,
@@ -80,15 +114,16 @@ pub(super) struct Turn<W: Work> {
 impl<W: Work> Job<W> {
     /// A job to do, or one that is done if its record says so.
     pub(super) fn new(id: ArtifactId, record: JobRecord, revision: Revision, work: W) -> Self {
-        let run = record.ending().is_none().then(|| Run {
-            shards: Shards {
-                places: (0..work.shards().max(1)).map(|_| None).collect(),
-                done: 0,
-            },
-            work: Arc::new(work),
-            key: RunKey::default(),
-            deadline: None,
-            taken: 0,
+        let run = record.ending().is_none().then(|| {
+            let shards = work.shards().max(1);
+            Run {
+                work: Arc::new(work),
+                key: RunKey::default(),
+                deadline: None,
+                taken: 0,
+                shards: Shards { places: (0..shards).map(|_| None).collect(), done: 0 },
+                told: Arc::new(Told::new(shards)),
+            }
         });
         Self { id, record, revision, run, changes: watch::Sender::new(()) }
     }
@@ -119,6 +154,7 @@ impl<W: Work> Job<W> {
             standing: record.standing(),
             shards_done: record.shards_done(),
             shards_total: record.shards_total(),
+            fraction: self.run.as_ref().map(|run| run.told.fraction()),
             attempts: record.attempts(),
             created: record.created(),
             started: record.started(),
@@ -193,6 +229,7 @@ impl<W: Work> Board<W> {
                 work: Arc::clone(&run.work),
                 run: Arc::clone(&run.key),
                 shard,
+                told: Arc::clone(&run.told),
                 deadline: *run.deadline.get_or_insert_with(|| Instant::now() + time_max),
                 is_first,
             };
@@ -210,6 +247,7 @@ impl<W: Work> Board<W> {
         let place = run.shards.places.get_mut(turn.shard)?;
         if place.replace(shard).is_none() {
             run.shards.done += 1;
+            run.told.shard(turn.shard, vbar_guidance::Progress { done: 1, total: 1 });
         }
         job.record.set_shards_done(run.shards.done);
         job.changes.send_replace(());

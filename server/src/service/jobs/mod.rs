@@ -47,7 +47,7 @@ pub(super) trait Work: Debug + Send + Sync + 'static {
     fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Self::Shard, Stopped>;
 
     /// Puts the shards, in their order, together and keeps what comes of them.
-    fn finish(&self, shards: Vec<Self::Shard>) -> Result<(), Stopped>;
+    fn finish(&self, shards: Vec<Self::Shard>, budget: Budget<'_>) -> Result<(), Stopped>;
 }
 
 /// Why a job did not make what it should.
@@ -206,8 +206,7 @@ impl<W: Work> Jobs<W> {
         if is_made {
             record.end(shards, Ending::Made);
         }
-        let revision =
-            inner.store.write(Ledger::Jobs, &id.0, record.encode().into(), replaced)?;
+        let revision = inner.store.write(Ledger::Jobs, &id.0, record.encode().into(), replaced)?;
         inner.count("accepted");
         let mut board = inner.board();
         board.place(id, Job::new(id, record, revision, work));

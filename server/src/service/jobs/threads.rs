@@ -9,7 +9,7 @@ use std::{
     time::Instant,
 };
 
-use vbar_guidance::{Budget, Interruption};
+use vbar_guidance::{Budget, Interruption, Progress};
 
 use super::{
     Ending, Inner, Stopped, Work,
@@ -83,7 +83,9 @@ impl<W: Work> Inner<W> {
             }
         };
         let start = Instant::now();
-        let shard = caught(|| turn.work.run_shard(turn.shard, Budget::new(&stop)));
+        let tell = |progress: Progress| turn.told.shard(turn.shard, progress);
+        let budget = Budget::new(&stop);
+        let shard = caught(|| turn.work.run_shard(turn.shard, budget.telling(&tell)));
         self.metrics.job_shard_seconds.observe(start.elapsed().as_secs_f64());
         // Cancelled or handed back: its end is written by whoever stopped it.
         if turn.run.load(Ordering::Relaxed) {
@@ -92,11 +94,14 @@ impl<W: Work> Inner<W> {
         let ended = match shard {
             Ok(shard) => {
                 let shards = self.board().deliver(turn, shard)?;
-                caught(|| turn.work.finish(shards))
+                let tell = |progress: Progress| turn.told.merge(progress);
+                caught(|| turn.work.finish(shards, budget.telling(&tell)))
             }
             Err(stopped) => Err(stopped),
         };
-        Some(ended.map_or_else(Ending::from, |()| Ending::Made))
+        // Stopped while it was merged: as above.
+        let is_stopped = ended.is_err() && turn.run.load(Ordering::Relaxed);
+        (!is_stopped).then(|| ended.map_or_else(Ending::from, |()| Ending::Made))
     }
 }
 
