@@ -1,4 +1,4 @@
-//! `vbar plan`, `vbar step`, `vbar precompute`, `vbar health`: one call, one answer as JSON.
+//! `vbar plan`, `vbar step`, `vbar health`: one call, one answer as JSON.
 
 use std::{
     fs::File,
@@ -51,13 +51,6 @@ pub(crate) struct StepArguments {
     node: NodeArguments,
 }
 
-/// Give a running node with --server: what a node of our own makes is gone when the command ends.
-#[derive(Debug, Args)]
-pub(crate) struct PrecomputeArguments {
-    #[command(flatten)]
-    mission: MissionArguments,
-}
-
 /// Made for the health check of a container.
 #[derive(Debug, Args)]
 pub(crate) struct HealthArguments {
@@ -102,22 +95,6 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
     let request: StepRequest = json::parse(&read(&arguments.request)?)?;
     let session = Session::open(&arguments.node).await?;
     let answer = session.client.step(request).await;
-    session.close().await;
-    json::print(&json::render(&answer?)?)
-}
-
-pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
-    let problem = match arguments.mission.load()? {
-        MissionFile::DisturbanceFeedback(mission) => {
-            arguments.mission.refuse_for_plans([])?;
-            mission.problem
-        }
-        MissionFile::VariableHorizon(mission) => {
-            arguments.mission.under_one_scheme(*mission)?.problem
-        }
-    };
-    let session = Session::open(&arguments.mission.node).await?;
-    let answer = session.client.precompute(problem).await;
     session.close().await;
     json::print(&json::render(&answer?)?)
 }

@@ -73,6 +73,10 @@ impl Work for Precompute {
         self.problem.method().name()
     }
 
+    fn is_made(&self) -> bool {
+        self.shelves.leases.expires(self.id).is_some()
+    }
+
     fn shards(&self) -> usize {
         self.problem.shards()
     }
@@ -151,15 +155,14 @@ impl Service {
             return Ok(OperationAnswer::Validated { id });
         }
         let id = record::problem_id(&problem);
-        let is_made = self.shelves.leases.expires(id).is_some();
-        if is_made {
+        let work = Precompute { id, problem, shelves: Arc::clone(&self.shelves) };
+        if work.is_made() {
             self.shelves.leases.extend(id);
         } else {
             // Better told now than after hours of work.
             self.shelves.leases.admit(0)?;
         }
-        let work = Precompute { id, problem, shelves: Arc::clone(&self.shelves) };
-        let order = Order { id, work, problem: message, request_id, is_made };
+        let order = Order { id, work, problem: message, request_id };
         let jobs = Arc::clone(&self.jobs);
         let submit = move |_: Budget<'_>| jobs.submit(order);
         self.compute.run("submit", call.deadline, submit).await?.value?;

@@ -1,5 +1,6 @@
 //! Real nodes on port 0, spoken to over real sockets.
 
+mod artifacts;
 mod grpc;
 mod http;
 mod limits;

@@ -40,6 +40,9 @@ pub(super) trait Work: Debug + Send + Sync + 'static {
     /// Name of the method.
     fn method(&self) -> &'static str;
 
+    /// Whether what it makes is there already.
+    fn is_made(&self) -> bool;
+
     /// Number of shards, at least 1.
     fn shards(&self) -> usize;
 
@@ -70,6 +73,18 @@ pub(super) enum Ending {
     Failed(Failure),
     /// Somebody asked for it.
     Cancelled,
+}
+
+impl Ending {
+    /// In the count of jobs.
+    fn outcome(&self) -> &'static str {
+        match self {
+            Self::Made => "succeeded",
+            Self::Infeasible(_) => "infeasible",
+            Self::Failed(_) => "failed",
+            Self::Cancelled => "cancelled",
+        }
+    }
 }
 
 impl From<Stopped> for Ending {
@@ -107,8 +122,6 @@ pub(super) struct Order<W> {
     pub(super) problem: Bytes,
     /// The caller's own name for it.
     pub(super) request_id: Option<String>,
-    /// What is to be made is there already.
-    pub(super) is_made: bool,
 }
 
 /// A job as it stands.
@@ -175,7 +188,8 @@ impl<W: Work> Jobs<W> {
     /// `ALREADY_EXISTS` for a request id that came with another problem, `RESOURCE_EXHAUSTED` if
     /// too many jobs are not done, `UNAVAILABLE` while the node ends or the store does not answer.
     pub(super) fn submit(&self, order: Order<W>) -> Result<View, Error> {
-        let Order { id, work, problem, request_id, is_made } = order;
+        let Order { id, work, problem, request_id } = order;
+        let is_made = work.is_made();
         let inner = &*self.inner;
         let mut requests = inner.journal();
         let is_repeated = match &request_id {
@@ -369,21 +383,25 @@ impl<W: Work> Inner<W> {
             } else {
                 Err(given_up(record.attempts()))
             };
-            match outcome {
+            let ending = match outcome {
+                // The node ended between the product and the note of it.
+                Ok(work) if work.is_made() => Ending::Made,
                 Ok(work) => {
                     record.hand_back();
                     self.count("resumed");
                     self.board().place(id, Job::new(id, record, revision, work));
+                    continue;
                 }
                 Err(failure) => {
                     tracing::error!(%id, message = failure.message, "a job is not taken up again");
-                    record.end(0, Ending::Failed(failure));
-                    let bytes = record.encode().into();
-                    let revision = self.store.write(Ledger::Jobs, &id.0, bytes, revision)?;
-                    self.count("failed");
-                    self.board().place(id, Job::finished(id, record, revision));
+                    Ending::Failed(failure)
                 }
-            }
+            };
+            self.count(ending.outcome());
+            record.end(record.shards_done(), ending);
+            let bytes = record.encode().into();
+            let revision = self.store.write(Ledger::Jobs, &id.0, bytes, revision)?;
+            self.board().place(id, Job::finished(id, record, revision));
         }
         self.metrics.jobs_unfinished.set(gauge(self.board().unfinished()));
         Ok(())
@@ -401,12 +419,7 @@ impl<W: Work> Inner<W> {
         let Some((mut record, revision)) = self.board().unfinished_record(&id, run) else {
             return Ok(());
         };
-        let outcome = match &ending {
-            Ending::Made => "succeeded",
-            Ending::Infeasible(_) => "infeasible",
-            Ending::Failed(_) => "failed",
-            Ending::Cancelled => "cancelled",
-        };
+        let outcome = ending.outcome();
         record.end(record.shards_done(), ending);
         let written = self.store.write(Ledger::Jobs, &id.0, record.encode().into(), revision);
         let revision = match (written, run) {

@@ -51,6 +51,10 @@ impl Work for Counting {
         "counting"
     }
 
+    fn is_made(&self) -> bool {
+        self.stage.made.lock().unwrap().contains_key(&self.name)
+    }
+
     fn shards(&self) -> usize {
         self.shards
     }
@@ -118,7 +122,6 @@ impl Fixture {
             work: Counting { name, shards: shards.into(), stage: Arc::clone(&self.stage) },
             problem: vec![name, shards].into(),
             request_id: request_id.map(str::to_owned),
-            is_made: false,
         })
     }
 
@@ -176,6 +179,20 @@ async fn job_is_joined_by_the_same_order_and_computed_once() {
     f.ended(1).await;
     assert_eq!(f.order(1, 1, None).unwrap().ending, Some(Ending::Made));
     assert_eq!(f.stage.begun(), [(1, 0)]);
+}
+
+#[tokio::test]
+async fn job_whose_product_is_there_is_done_at_once() {
+    let f = fixture(LIMITS);
+    f.stage.made.lock().unwrap().insert(1, vec![0]);
+    assert_eq!(f.order(1, 1, None).unwrap().ending, Some(Ending::Made));
+    // Also if its node ended before it could write that down.
+    f.order(2, 1, None).unwrap();
+    f.until_begun(1);
+    f.stage.made.lock().unwrap().insert(2, vec![0]);
+    let f = f.reopened();
+    assert_eq!(f.standing(2), Standing::Succeeded);
+    assert_eq!(f.stage.begun(), [(2, 0)]);
 }
 
 #[tokio::test]
