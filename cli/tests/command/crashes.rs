@@ -22,13 +22,25 @@ use super::{Process, measured_at, mission};
 const CRASHES: u32 = 5;
 
 /// What the node acknowledged.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 struct Acknowledged {
     operations: BTreeSet<String>,
     plans: BTreeSet<String>,
     /// Artifacts that were fetched, with the digest of their bytes.
     artifacts: BTreeMap<String, String>,
     steps: u64,
+}
+
+impl Acknowledged {
+    fn take_in(&mut self, later: Self) {
+        self.operations.extend(later.operations);
+        self.plans.extend(later.plans);
+        for (id, digest) in later.artifacts {
+            let known = self.artifacts.insert(id, digest.clone());
+            assert!(known.is_none_or(|known| known == digest), "an artifact changed");
+        }
+        self.steps += later.steps;
+    }
 }
 
 type Shared = Arc<Mutex<Acknowledged>>;
@@ -144,25 +156,28 @@ async fn node_killed_at_any_moment_loses_nothing_it_acknowledged() {
     let data = folder.path().join("data");
     let arguments = ["--data-dir", data.to_str().unwrap(), "--config", config.to_str().unwrap()];
     let missions = Arc::new(Missions::load());
-    let seen = Shared::default();
+    let mut all = Acknowledged::default();
+    let mut latest = Acknowledged::default();
     for crash in 0..crashes {
         let mut node = Process::start(&arguments);
         let client = client(&node).await;
-        let known = seen.lock().unwrap().clone();
-        check(&client, &known).await;
+        check(&client, &latest).await;
+        all.take_in(latest);
+        let seen = Shared::default();
         let load = load(client, Arc::clone(&missions), Arc::clone(&seen), crash.into());
         let load = tokio::spawn(load);
         tokio::time::sleep(Duration::from_millis(100 + chance(&mut random) % 400)).await;
         node.child.kill().unwrap();
         node.child.wait().unwrap();
         load.await.unwrap();
+        latest = std::mem::take(&mut *seen.lock().unwrap());
     }
+    all.take_in(latest);
     let node = Process::start(&arguments);
     let client = client(&node).await;
-    let mut seen = seen.lock().unwrap().clone();
-    finish(&client, &mut seen).await;
-    check(&client, &seen).await;
-    let Acknowledged { operations, plans, artifacts, steps } = seen;
+    finish(&client, &mut all).await;
+    check(&client, &all).await;
+    let Acknowledged { operations, plans, artifacts, steps } = all;
     println!(
         "killed {crashes} times; kept {} operations, {} plans, {} artifacts; {steps} steps",
         operations.len(),

@@ -60,8 +60,8 @@ impl Work for Counting {
     }
 
     fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<usize, Stopped> {
-        self.stage.begun.lock().unwrap().push((self.name, shard));
         budget.tell(1, 2);
+        self.stage.begun.lock().unwrap().push((self.name, shard));
         assert_ne!(self.name, PANICS, "a bug");
         while !self.stage.take_one() {
             budget.check().map_err(|interruption| {
