@@ -159,6 +159,10 @@ impl Parse for Problem {
             Some(Message::DisturbanceFeedback(problem)) => {
                 asked::<DisturbanceFeedback>(problem, path.field("disturbance_feedback"), door)
             }
+            Some(Message::AbortSafe(_)) => {
+                let served = "one of variable_horizon, disturbance_feedback";
+                door.refuse(path, served, "abort_safe, which this server does not serve yet")
+            }
         }
     }
 }
@@ -185,6 +189,7 @@ impl Problem {
         Some(match message.method.as_ref()? {
             Message::VariableHorizon(_) => VariableHorizon::PLANNING,
             Message::DisturbanceFeedback(_) => DisturbanceFeedback::PLANNING,
+            Message::AbortSafe(_) => return None,
         })
     }
 

@@ -48,6 +48,8 @@ pub struct Limits {
     pub polytope_rows_max: usize,
     /// Most instants of a plan with disturbance feedback.
     pub plan_instants_max: usize,
+    /// Most states of a safety report.
+    pub report_states_max: usize,
 }
 
 impl Default for Limits {
@@ -62,6 +64,7 @@ impl Default for Limits {
             steps_max: 10_000,
             polytope_rows_max: 64,
             plan_instants_max: PLAN_INSTANTS_MAX,
+            report_states_max: 2000,
         }
     }
 }
