@@ -29,8 +29,8 @@ use vbar_proto::{
         GetArtifactResponse, GetPlanRequest, GetPlanResponse, GetServerInfoRequest,
         GetServerInfoResponse, ListArtifactsRequest, ListArtifactsResponse, ListPlansRequest,
         ListPlansResponse, Measurement, PrecomputeMetadata, PrecomputeRequest, PrecomputeResponse,
-        Problem, StepRequest, StepResponse, StepStreamRequest, StepStreamResponse,
-        UploadPlanRequest, UploadPlanResponse,
+        Problem, SafetyReportRequest, SafetyReportResponse, SafetySummary, StepRequest,
+        StepResponse, StepStreamRequest, StepStreamResponse, UploadPlanRequest, UploadPlanResponse,
         guidance_service_server::{GuidanceService, GuidanceServiceServer},
         precompute_response::Outcome,
         step_stream_request::Controller,
@@ -216,6 +216,16 @@ impl GuidanceService for Scripted {
         Ok(Response::new(StepResponse { step_index: 7, ..StepResponse::default() }))
     }
 
+    async fn safety_report(
+        &self,
+        request: Request<SafetyReportRequest>,
+    ) -> Result<Response<SafetyReportResponse>, Status> {
+        self.follow(&request).await?;
+        let verdicts = request.into_inner().first_step_index;
+        let summary = Some(SafetySummary { verdicts, ..SafetySummary::default() });
+        Ok(Response::new(SafetyReportResponse { summary, ..SafetyReportResponse::default() }))
+    }
+
     /// Each answer's controller state is the number of messages this node has seen.
     async fn step_stream(
         &self,
@@ -373,6 +383,15 @@ async fn plan_calls_are_repeated_and_answered() {
     let request = ExportPlanRequest { plan_id: "p2".into(), ..ExportPlanRequest::default() };
     assert_eq!(client.export_plan(request).await.unwrap().file_name, "p2");
     assert_eq!(node.calls(), 2);
+}
+
+#[tokio::test]
+async fn safety_report_is_repeated_and_answered() {
+    let node = Scripted::new([unavailable()]);
+    let client = connected(&node).await;
+    let request = SafetyReportRequest { first_step_index: 7, ..SafetyReportRequest::default() };
+    let answer = client.safety_report(request).await.unwrap();
+    assert_eq!((answer.summary.unwrap().verdicts, node.calls()), (7, 2));
 }
 
 #[tokio::test]

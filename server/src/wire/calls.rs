@@ -155,6 +155,10 @@ impl Parse for PlanCall {
                 door.refuse(place, "nothing: the problem has its initial state", "a measurement")
             }
             (Some(Planning::IsArtifact), None) => Some(None),
+            (Some(Planning::Stepwise), _) => {
+                let expected = "a method that plans: variable_horizon, disturbance_feedback";
+                door.refuse(path.field("problem"), expected, "one that decides step by step")
+            }
             (_, initial) => door.message(initial, place).map(Some),
         };
         Some(Self { problem: problem?, initial: initial?, validate_only: message.validate_only })
@@ -384,6 +388,7 @@ impl Render for InfoAnswer {
                 steps_max: count(self.limits.steps_max),
                 polytope_rows_max: count(self.limits.polytope_rows_max),
                 plan_instants_max: count(self.limits.plan_instants_max),
+                report_states_max: count(self.limits.report_states_max),
                 concurrent_computations_max: count(self.compute_threads),
                 computation_time_max_s: self.computation_time_max.as_secs_f64(),
             }),

@@ -4,6 +4,7 @@
 //! Nothing is repaired here. A value is taken as it is or refused; where a message leaves a choice
 //! to the server, the `.proto` file says which one is made.
 
+mod abort_safe;
 mod artifacts;
 mod calls;
 mod controller_state;
@@ -20,6 +21,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+pub(crate) use abort_safe::{ReportAnswer, ReportCall, ReportFault};
 pub(crate) use artifacts::{
     ArtifactAnswer, ArtifactCall, ArtifactsAnswer, ArtifactsCall, DownloadAnswer, DownloadCall,
     StoredArtifact,
@@ -62,6 +64,8 @@ pub struct Limits {
     pub polytope_rows_max: usize,
     /// Most instants of a plan with disturbance feedback.
     pub plan_instants_max: usize,
+    /// Most states of a safety report.
+    pub report_states_max: usize,
 }
 
 impl Default for Limits {
@@ -76,6 +80,7 @@ impl Default for Limits {
             steps_max: 10_000,
             polytope_rows_max: 64,
             plan_instants_max: PLAN_INSTANTS_MAX,
+            report_states_max: 2000,
         }
     }
 }

@@ -131,10 +131,7 @@ pub(super) fn vertices(problem: &Problem) -> Result<Vec<PlantMatrices>, PrepareE
 }
 
 /// Refuses a gain under which a vertex is not stable, and names every such vertex.
-fn check_stable(
-    vertices: &[PlantMatrices],
-    gain: &DMatrix<f64>,
-) -> Result<(), PrepareError> {
+fn check_stable(vertices: &[PlantMatrices], gain: &DMatrix<f64>) -> Result<(), PrepareError> {
     let unstable = |(index, vertex): (usize, &PlantMatrices)| {
         let radius = spectral_radius(&(&vertex.a + product(&vertex.b, gain)));
         (!(radius < 1.0)).then(|| {
@@ -183,10 +180,7 @@ fn plant_vertices<'a>(
 
 /// Q, R, and P with equality in [Mammarella2019, eq. 3]: over samples of the plant, or for the
 /// expected plant where nothing is sampled.
-fn weights(
-    problem: &Problem,
-    gain: &DMatrix<f64>,
-) -> Result<StageWeights, PrepareError> {
+fn weights(problem: &Problem, gain: &DMatrix<f64>) -> Result<StageWeights, PrepareError> {
     let closed_loop = |step: PlantMatrices| step.a + product(&step.b, gain);
     let sampled = |sample: usize| {
         let mut stream = Stream::new(problem.seed, TERMINAL_STREAM, sample as u64);

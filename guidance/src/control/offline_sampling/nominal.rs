@@ -23,8 +23,7 @@ pub(super) fn prepare(problem: &Problem, budget: Budget<'_>) -> Result<Artifact,
     let cost = nominal.cost(&design.weights);
     let (rows, groups) = nominal.rows(&design.constraints, &design.groups);
     let none = HalfSpaces::new(rows.dimension());
-    let reduction =
-        irredundant(&rows, &none, EXACT, budget).map_err(|reason| no_set(&reason))?;
+    let reduction = irredundant(&rows, &none, EXACT, budget).map_err(|reason| no_set(&reason))?;
     let kept: Vec<StageGroup> = reduction.kept.iter().map(|&row| groups[row]).collect();
     let mut summary = design.summary(summaries(&design.groups, &groups, &kept));
     summary.doubtful_rows = reduction.doubtful;

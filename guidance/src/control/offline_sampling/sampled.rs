@@ -166,8 +166,7 @@ fn add_first_step(
     budget: Budget<'_>,
 ) -> Result<(), PrepareError> {
     let vertices = design.plant_vertices(true);
-    let grown =
-        grow_control_invariant(&parts.terminal_set, &parts.rows, &vertices, limits, budget);
+    let grown = grow_control_invariant(&parts.terminal_set, &parts.rows, &vertices, limits, budget);
     let Growth { set, limited, .. } = grown.map_err(|error| match error {
         GrowthError::Seed(reason) => no_set(&reason),
         GrowthError::Interrupted(why) => why.into(),
