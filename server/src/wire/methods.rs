@@ -159,6 +159,10 @@ impl Parse for Problem {
             Some(Message::DisturbanceFeedback(problem)) => {
                 asked::<DisturbanceFeedback>(problem, path.field("disturbance_feedback"), door)
             }
+            Some(Message::OfflineSampling(_)) => {
+                let served = "one of variable_horizon, disturbance_feedback";
+                door.refuse(path, served, "offline_sampling, which this server does not serve yet")
+            }
             Some(Message::AbortSafe(_)) => {
                 let served = "one of variable_horizon, disturbance_feedback";
                 door.refuse(path, served, "abort_safe, which this server does not serve yet")
@@ -189,7 +193,7 @@ impl Problem {
         Some(match message.method.as_ref()? {
             Message::VariableHorizon(_) => VariableHorizon::PLANNING,
             Message::DisturbanceFeedback(_) => DisturbanceFeedback::PLANNING,
-            Message::AbortSafe(_) => return None,
+            Message::AbortSafe(_) | Message::OfflineSampling(_) => return None,
         })
     }
 
