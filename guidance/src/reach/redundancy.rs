@@ -89,6 +89,7 @@ pub fn irredundant(
     for row in 0..candidates.len() {
         if row % BUDGET_PERIOD == 0 {
             budget.check()?;
+            budget.tell(row, candidates.len());
         }
         if search.fate[row] == Fate::Open {
             search.decide(row);

@@ -115,11 +115,15 @@ impl Scenario<'_> {
     /// Rows of all groups, had none been removed.
     #[must_use]
     pub fn row_count(&self) -> usize {
-        let rows = |(group, size): (&StageGroup, &usize)| {
-            let certain = group.family == StageFamily::Input && group.stage == 0;
-            self.constraints.of(group.family).len() * if certain { 1 } else { *size }
-        };
-        self.groups.iter().zip(self.sizes).map(rows).sum()
+        (0..self.groups.len()).map(|group| self.group_row_count(group)).sum()
+    }
+
+    /// Rows of a group, had none been removed.
+    #[must_use]
+    pub fn group_row_count(&self, group: usize) -> usize {
+        let StageGroup { family, stage } = self.groups[group];
+        let certain = family == StageFamily::Input && stage == 0;
+        self.constraints.of(family).len() * if certain { 1 } else { self.sizes[group] }
     }
 
     /// The needed rows among the first few samples of every group. They stay in every reduction,

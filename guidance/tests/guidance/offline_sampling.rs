@@ -9,13 +9,14 @@ use vbar_guidance::{
         Claim, Controller, PrepareError, StepError,
         offline_sampling::{
             Artifact, Branch, CostWeights, GainChoice, Measurement, OfflineSampling, Problem,
-            Redundancy, SampleChoice, State, Step, Verdict,
+            Redundancy, RowOrigin, SampleChoice, Scheme, State, Step, Verdict,
         },
     },
     dynamics::{Discretisation, MatrixPolynomial, UncertainPlant},
     reach::{GrowthLimits, InvariantLimits},
     sampling::ScalarLaw,
     sets::Polytope,
+    units::Seconds,
 };
 
 const DISTURBANCE: f64 = 0.02;
@@ -42,6 +43,7 @@ fn problem() -> Problem {
     let identity = DMatrix::identity(2, 2);
     let half = DMatrix::from_element(1, 1, 0.5);
     Problem {
+        scheme: Scheme::OfflineSampling,
         plant,
         vertices: None,
         disturbance: vec![ScalarLaw::Uniform { low: -DISTURBANCE, high: DISTURBANCE }; 2],
@@ -56,10 +58,11 @@ fn problem() -> Problem {
             variables: None,
             size: Some(400),
             state_at_start: false,
+            rows_max: 50_000,
         },
         redundancy: Redundancy::Exact,
         terminal_limits: InvariantLimits { iterations_max: 100, rows_max: 500 },
-        growth: GrowthLimits { rounds: 20, directions: 40, facets_max: 300 },
+        first_step: Some(GrowthLimits { rounds: 20, directions: 40, facets_max: 300 }),
         seed: 11,
     }
 }
@@ -70,11 +73,11 @@ fn prepare(problem: &Problem) -> Result<Artifact, PrepareError> {
     let count = OfflineSampling::shards(problem);
     let mut shards = (0..count).rev().map(run).collect::<Result<Vec<_>, _>>()?;
     shards.reverse();
-    OfflineSampling::merge(problem, shards)
+    OfflineSampling::merge(problem, shards, Budget::UNLIMITED)
 }
 
 fn step(artifact: &Artifact, state: &State, x: &DVector<f64>) -> Step {
-    let measurement = Measurement { state: x.clone() };
+    let measurement = Measurement { state: x.clone(), elapsed: None };
     OfflineSampling::step(artifact, state, &measurement, Budget::UNLIMITED).unwrap()
 }
 
@@ -90,7 +93,7 @@ fn offline_sampling_keeps_every_promise_in_closed_loop() {
     while flown < 20 {
         let x =
             DVector::from_vec(vec![chance.random_range(-4.0..4.0), chance.random_range(-1.5..1.5)]);
-        if artifact.first_step_set().violation(x.as_slice()) > -1e-6 {
+        if artifact.first_step_set().unwrap().violation(x.as_slice()) > -1e-6 {
             continue;
         }
         flown += 1;
@@ -108,7 +111,7 @@ fn offline_sampling_keeps_every_promise_in_closed_loop() {
             let w = DVector::from_fn(2, |_, _| chance.random_range(-DISTURBANCE..DISTURBANCE));
             x = &plant.a * &x + &plant.b * &command.input + w;
             // What was proved: the successor lies in the first-step set.
-            assert!(artifact.first_step_set().violation(x.as_slice()) <= 1e-7, "step {k}");
+            assert!(artifact.first_step_set().unwrap().violation(x.as_slice()) <= 1e-7, "step {k}");
             state = State::from_bytes(&step.next.to_bytes()).unwrap();
             assert_eq!(state, step.next);
         }
@@ -160,14 +163,14 @@ fn offline_sampling_refuses_what_does_not_fit() {
     wrong.samples.violation = 0.2;
     let Err(PrepareError::Faults(faults)) = prepare(&wrong) else { panic!("accepted") };
     let fields: Vec<&str> = faults.iter().map(|fault| fault.field.as_str()).collect();
-    assert_eq!(fields, ["weights.input", "samples"]);
+    assert_eq!(fields, ["weights.input", "samples.violation"]);
 
     let mut rough = problem();
     rough.disturbance = vec![ScalarLaw::Uniform { low: -3.0, high: 3.0 }; 2];
     assert!(matches!(prepare(&rough), Err(PrepareError::Infeasible(_))));
 
     let artifact = prepare(&problem()).unwrap();
-    let short = Measurement { state: DVector::zeros(1) };
+    let short = Measurement { state: DVector::zeros(1), elapsed: None };
     let start = OfflineSampling::start(&artifact);
     let refused = OfflineSampling::step(&artifact, &start, &short, Budget::UNLIMITED);
     assert!(matches!(refused, Err(StepError::Measurement(_))), "{refused:?}");
@@ -179,12 +182,12 @@ fn offline_sampling_scaled_inwards_is_inside_the_exact_set() {
     let mut coarse = problem();
     coarse.redundancy = Redundancy::InnerScaled { epsilon: 0.02 };
     let coarse = prepare(&coarse).unwrap();
-    assert!(coarse.summary().kept_rows < exact.summary().kept_rows);
+    assert!(coarse.summary().kept_rows() < exact.summary().kept_rows());
     assert!(coarse.summary().outer_excess > 0.0);
     // A point of the coarse set satisfies every row of the exact one.
     let mut chance = ChaCha8Rng::seed_from_u64(9);
     let sampled: Vec<usize> =
-        (0..exact.rows().len()).filter(|&row| exact.origin(row).is_some()).collect();
+        (0..exact.rows().len()).filter(|&row| exact.origin(row) != RowOrigin::FirstStep).collect();
     let only_sampled = exact.rows().select(&sampled);
     let mut inside = 0;
     for _ in 0..20_000 {

@@ -222,14 +222,18 @@ impl Problem {
     }
 
     /// Puts shards, in their order, together.
-    pub(crate) fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
-        self.0.merge(shards)
+    pub(crate) fn merge(
+        &self,
+        shards: Vec<Shard>,
+        budget: Budget<'_>,
+    ) -> Result<Artifact, PrepareError> {
+        self.0.merge(shards, budget)
     }
 
     /// Thinks long once: every shard in order, on the caller's thread.
     pub(crate) fn prepare(&self, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
         let shards = (0..self.shards()).map(|shard| self.run_shard(shard, budget));
-        self.merge(shards.collect::<Result<_, _>>()?)
+        self.merge(shards.collect::<Result<_, _>>()?, budget)
     }
 
     /// Writes why no artifact can be made.
@@ -397,7 +401,7 @@ trait AnyProblem: fmt::Debug + Send + Sync {
     fn units(&self) -> types::Units;
     fn shards(&self) -> usize;
     fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Shard, PrepareError>;
-    fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError>;
+    fn merge(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<Artifact, PrepareError>;
 }
 
 /// A problem of method `M`.
@@ -430,12 +434,12 @@ impl<M: Wired> AnyProblem for Asked<M> {
         M::run_shard(&self.0, shard, budget).map(|shard| Shard(Box::new(shard)))
     }
 
-    fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+    fn merge(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
         let own = shards.into_iter().map(|Shard(shard)| match shard.downcast::<M::Shard>() {
             Ok(shard) => Ok(*shard),
             Err(_) => Err(Failure::Numerical("a shard of another method".to_owned())),
         });
-        M::merge(&self.0, own.collect::<Result<_, _>>()?).map(Made::<M>::artifact)
+        M::merge(&self.0, own.collect::<Result<_, _>>()?, budget).map(Made::<M>::artifact)
     }
 }
 

@@ -1,0 +1,193 @@
+//! The offline part of the method itself, in shards: sampled rows, expected cost, first-step set.
+
+use super::{
+    Artifact, GroupSummary, Problem, Redundancy, RowOrigin, Summary,
+    artifact::Parts,
+    design::{Design, assembled, no_set},
+};
+use crate::{
+    budget::Budget,
+    control::{Failure, Fault, PrepareError},
+    dynamics::ExpectedCost,
+    reach::{
+        EXACT, Growth, GrowthError, GrowthLimits, HalfSpaces, SampledRows, Scenario,
+        grow_control_invariant, irredundant, step_back,
+    },
+    sampling::failure_of_any,
+};
+
+/// Stream of the samples of the expected cost, apart from those of the groups.
+const COST_STREAM: u64 = u64::MAX;
+
+/// Part of an artifact.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Shard {
+    /// The rows of one part of a group that are needed beside the context.
+    Rows(SampledRows),
+    /// The expected cost.
+    Cost(ExpectedCost),
+    /// Everything: the baselines take milliseconds.
+    Whole(Box<Artifact>),
+}
+
+/// A design with what is sampled.
+struct Sampling<'a> {
+    problem: &'a Problem,
+    design: Design,
+    sizes: Vec<usize>,
+}
+
+impl<'a> Sampling<'a> {
+    fn new(problem: &'a Problem, budget: Budget<'_>) -> Result<Self, PrepareError> {
+        let design = Design::new(problem, budget)?;
+        let this = Self { problem, design, sizes: problem.sizes() };
+        let rows = this.scenario().row_count();
+        if rows > problem.samples.rows_max {
+            let expected = format!("at most {} rows", problem.samples.rows_max);
+            let fault = Fault::new("samples.rows_max", expected, format!("{rows} rows"));
+            return Err(PrepareError::Faults(vec![fault]));
+        }
+        Ok(this)
+    }
+
+    fn scenario(&self) -> Scenario<'_> {
+        Scenario {
+            plant: &self.problem.plant,
+            disturbance: &self.problem.disturbance,
+            gain: &self.design.gain,
+            horizon: self.problem.horizon,
+            constraints: &self.design.constraints,
+            groups: &self.design.groups,
+            sizes: &self.sizes,
+            seed: self.problem.seed,
+        }
+    }
+
+    fn cost(&self, budget: Budget<'_>) -> Result<ExpectedCost, PrepareError> {
+        let (n, m) = self.problem.dimensions();
+        let scenario = self.scenario();
+        let mut cost = ExpectedCost::new(n + self.problem.horizon * m + 1);
+        for sample in 0..self.problem.weights.samples {
+            budget.check()?;
+            let prediction = scenario.prediction(COST_STREAM, sample, self.problem.horizon);
+            cost.add(&prediction, &self.design.weights);
+        }
+        Ok(cost)
+    }
+}
+
+/// One a sampled group, and one for the expected cost.
+pub(super) fn shards(problem: &Problem) -> usize {
+    problem.groups().len() + 1
+}
+
+pub(super) fn run_shard(
+    problem: &Problem,
+    shard: usize,
+    budget: Budget<'_>,
+) -> Result<Shard, PrepareError> {
+    let sampling = Sampling::new(problem, budget.untold())?;
+    let scenario = sampling.scenario();
+    if shard >= sampling.sizes.len() {
+        return sampling.cost(budget).map(Shard::Cost);
+    }
+    let context = scenario.context(budget.untold()).map_err(|reason| no_set(&reason))?;
+    let rows = scenario.survivors(shard, &context, budget);
+    rows.map(Shard::Rows).map_err(|reason| no_set(&reason))
+}
+
+pub(super) fn merge(
+    problem: &Problem,
+    shards: &[Shard],
+    budget: Budget<'_>,
+) -> Result<Artifact, PrepareError> {
+    let sampling = Sampling::new(problem, budget.untold())?;
+    let scenario = sampling.scenario();
+    let mut survivors = Vec::new();
+    let mut cost = None;
+    for shard in shards {
+        match shard {
+            Shard::Rows(rows) => survivors.push(rows.clone()),
+            Shard::Cost(part) => cost = Some(part.mean()),
+            Shard::Whole(_) => {}
+        }
+    }
+    let (Some(cost), true) = (cost, survivors.len() == sampling.sizes.len()) else {
+        return Err(Failure::Numerical("shards are missing".into()).into());
+    };
+    let tolerance = match problem.redundancy {
+        Redundancy::Exact => EXACT,
+        Redundancy::InnerScaled { epsilon } => epsilon,
+    };
+    let context = scenario.context(budget.untold()).map_err(|reason| no_set(&reason))?;
+    let (sampled, reduction) = Scenario::merged(&context, &survivors, tolerance, budget)
+        .map_err(|reason| no_set(&reason))?;
+    let mut summary = sampling.design.summary(groups(&scenario, &sampled));
+    summary.doubtful_rows = reduction.doubtful;
+    summary.outer_excess = reduction.outer_excess;
+    if problem.sampled_by_the_bound() {
+        let claims = problem.claims(summary.terminal_rows);
+        let delta = problem.samples.confidence_complement;
+        summary.joint_confidence = Some(1.0 - failure_of_any(claims, delta));
+    }
+    let origin = |&group: &usize| RowOrigin::Stage(sampling.design.groups[group]);
+    let mut parts = Parts {
+        problem: problem.clone(),
+        origins: sampled.groups.iter().map(origin).collect(),
+        rows: sampled.rows,
+        summary,
+        cost,
+        terminal_set: sampling.design.constraints.terminal.clone(),
+        first_step_set: None,
+    };
+    if let Some(limits) = problem.first_step {
+        add_first_step(&mut parts, &sampling.design, limits, budget)?;
+    }
+    assembled(parts)
+}
+
+/// What became of every group.
+fn groups(scenario: &Scenario<'_>, sampled: &SampledRows) -> Vec<GroupSummary> {
+    let summary = |index: usize| GroupSummary {
+        group: scenario.groups[index],
+        samples: scenario.sizes[index],
+        rows: scenario.group_row_count(index),
+        kept: sampled.groups.iter().filter(|&&group| group == index).count(),
+    };
+    (0..scenario.groups.len()).map(summary).collect()
+}
+
+/// D_R: every successor lies in a set grown from the terminal one; without rows that the sampled
+/// ones make redundant. [Mammarella2019, eq. 15]
+fn add_first_step(
+    parts: &mut Parts,
+    design: &Design,
+    limits: GrowthLimits,
+    budget: Budget<'_>,
+) -> Result<(), PrepareError> {
+    let vertices = design.plant_vertices(true);
+    let grown =
+        grow_control_invariant(&parts.terminal_set, &parts.rows, &vertices, limits, budget);
+    let Growth { set, limited, .. } = grown.map_err(|error| match error {
+        GrowthError::Seed(reason) => no_set(&reason),
+        GrowthError::Interrupted(why) => why.into(),
+        other => Failure::Numerical(format!("the first-step set: {other:?}")).into(),
+    })?;
+    let width = parts.rows.dimension();
+    let mut rows = HalfSpaces::new(width);
+    let mut normal = vec![0.0; width];
+    let successors = step_back(&set, &vertices);
+    for row in 0..successors.len() {
+        let known = successors.normal(row);
+        normal[..known.len()].copy_from_slice(known);
+        rows.push(&normal, successors.offset(row));
+    }
+    let needed = irredundant(&rows, &parts.rows, EXACT, budget.untold());
+    let kept = needed.map_err(|reason| no_set(&reason))?.kept;
+    parts.rows.extend(&rows.select(&kept));
+    parts.origins.extend(std::iter::repeat_n(RowOrigin::FirstStep, kept.len()));
+    let Summary { first_step_rows, first_step_limited, .. } = &mut parts.summary;
+    (*first_step_rows, *first_step_limited) = (kept.len(), limited);
+    parts.first_step_set = Some(set);
+    Ok(())
+}
