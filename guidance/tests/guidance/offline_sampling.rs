@@ -8,8 +8,8 @@ use vbar_guidance::{
     control::{
         Claim, Controller, PrepareError, StepError,
         offline_sampling::{
-            Artifact, Branch, CostWeights, GainChoice, Measurement, OfflineSampling, Problem,
-            Redundancy, RowOrigin, SampleChoice, Scheme, State, Step, Verdict,
+            Artifact, Branch, Coordinates, CostWeights, GainChoice, Measurement, OfflineSampling,
+            Problem, Redundancy, RowOrigin, SampleChoice, Scheme, State, Step, Verdict,
         },
     },
     dynamics::{Discretisation, MatrixPolynomial, UncertainPlant},
@@ -45,6 +45,7 @@ fn problem() -> Problem {
     Problem {
         scheme: Scheme::OfflineSampling,
         plant,
+        coordinates: Coordinates::General,
         vertices: None,
         disturbance: vec![ScalarLaw::Uniform { low: -DISTURBANCE, high: DISTURBANCE }; 2],
         horizon: 5,

@@ -152,8 +152,8 @@ impl Service {
         let timed = self.compute.run("plan", call.deadline, work).await?;
         let (verdict, kept) = timed.value?;
         self.count(verdict.work);
-        if verdict.certificate.is_some() {
-            self.withhold_unless_passed(verdict.certificate.as_ref())?;
+        if let Some(certificate) = &verdict.certificate {
+            self.withhold_unless(certificate.passed, Some(certificate))?;
         }
         self.planned(if verdict.is_infeasible() { "infeasible" } else { "computed" });
         let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
@@ -356,7 +356,7 @@ impl Service {
             VerdictKind::Infeasible => "infeasible",
         };
         if answer.step.kind() == VerdictKind::Command {
-            self.withhold_unless_passed(answer.step.certificate())?;
+            self.withhold_unless(answer.step.may_leave(), answer.step.certificate())?;
         }
         self.metrics.verdicts.get_or_create(&OutcomeLabels { outcome }).inc();
         Ok(Timed { value: answer, compute: timed.compute })
@@ -472,9 +472,13 @@ impl Service {
         Ok(Timed { value: (id, method), compute: timed.compute })
     }
 
-    /// An answer whose certificate did not pass never leaves as an answer.
-    fn withhold_unless_passed(&self, certificate: Option<&Certificate>) -> Result<(), Error> {
-        if certificate.is_some_and(|certificate| certificate.passed) {
+    /// An answer whose certificate did not pass never leaves as a proved answer.
+    fn withhold_unless(
+        &self,
+        may_leave: bool,
+        certificate: Option<&Certificate>,
+    ) -> Result<(), Error> {
+        if may_leave {
             return Ok(());
         }
         self.metrics.certificate_failures.inc();

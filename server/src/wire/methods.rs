@@ -11,6 +11,7 @@ use vbar_guidance::{
     control::{
         Certificate, Controller, Failure, Fault, Infeasibility, PrepareError, StepError,
         disturbance_feedback::{self, DisturbanceFeedback},
+        offline_sampling::OfflineSampling,
         variable_horizon::VariableHorizon,
     },
 };
@@ -63,8 +64,11 @@ pub(super) trait Wired:
     /// Reads what [`Wired::state_to_bytes`] wrote.
     fn state_from_bytes(bytes: &[u8]) -> Result<Self::State, String>;
 
-    /// The measurement as this method takes it; the fault's field is relative to it.
-    fn measurement(measured: &ElapsedAndState) -> Result<Self::Measurement, Fault>;
+    /// The measurement as this artifact takes it; the fault's field is relative to it.
+    fn measurement(
+        artifact: &Self::Artifact,
+        measured: &ElapsedAndState,
+    ) -> Result<Self::Measurement, Fault>;
 
     /// The state for the next step.
     fn next(step: &Self::Answer) -> &Self::State;
@@ -72,6 +76,10 @@ pub(super) trait Wired:
     fn kind(step: &Self::Answer) -> VerdictKind;
     /// The proof, if there is a command.
     fn certificate(step: &Self::Answer) -> Option<&Certificate>;
+    /// Whether a command may leave: its proof holds, or it says itself that it promises nothing.
+    fn may_leave(step: &Self::Answer) -> bool {
+        Self::certificate(step).is_some_and(|certificate| certificate.passed)
+    }
     /// What the solvers did.
     fn work(step: &Self::Answer) -> SolverWork;
     /// Everything of a step's answer but what its envelope knows: controller state, provenance.
@@ -82,12 +90,15 @@ pub(super) trait Wired:
     ) -> v1::StepResponse;
 
     /// Computes a plan to fly without re-optimising; `initial` is there if
-    /// [`Planning::FromMeasurement`].
+    /// [`Planning::FromMeasurement`]. Not asked of a method that is [`Planning::Stepwise`].
     fn plan(
-        artifact: &Self::Artifact,
-        initial: Option<&ElapsedAndState>,
-        budget: Budget<'_>,
-    ) -> Result<PlanVerdict, StepError>;
+        _artifact: &Self::Artifact,
+        _initial: Option<&ElapsedAndState>,
+        _budget: Budget<'_>,
+    ) -> Result<PlanVerdict, StepError> {
+        let what = format!("{} decides step by step and has no plan", Self::METHOD.name());
+        Err(Failure::Numerical(what).into())
+    }
 }
 
 /// What `ComputePlan` means for a method.
@@ -97,6 +108,8 @@ pub(crate) enum Planning {
     FromMeasurement,
     /// Its artifact is the plan; the problem has its initial state.
     IsArtifact,
+    /// It decides step by step: there is no plan to fly without asking again.
+    Stepwise,
 }
 
 /// A plan, or why there is none.
@@ -143,6 +156,8 @@ pub(crate) enum VerdictKind {
     Infeasible,
 }
 
+const METHODS: &str = "one of variable_horizon, disturbance_feedback, offline_sampling";
+
 /// A mission.
 #[derive(Debug, Clone)]
 pub(crate) struct Problem(Arc<dyn AnyProblem>);
@@ -152,20 +167,18 @@ impl Parse for Problem {
 
     fn parse(message: &v1::Problem, path: Path<'_>, door: &mut Door) -> Option<Self> {
         match &message.method {
-            None => door.refuse(path, "one of variable_horizon, disturbance_feedback", "nothing"),
+            None => door.refuse(path, METHODS, "nothing"),
             Some(Message::VariableHorizon(problem)) => {
                 asked::<VariableHorizon>(problem, path.field("variable_horizon"), door)
             }
             Some(Message::DisturbanceFeedback(problem)) => {
                 asked::<DisturbanceFeedback>(problem, path.field("disturbance_feedback"), door)
             }
-            Some(Message::OfflineSampling(_)) => {
-                let served = "one of variable_horizon, disturbance_feedback";
-                door.refuse(path, served, "offline_sampling, which this server does not serve yet")
+            Some(Message::OfflineSampling(problem)) => {
+                asked::<OfflineSampling>(problem, path.field("offline_sampling"), door)
             }
             Some(Message::AbortSafe(_)) => {
-                let served = "one of variable_horizon, disturbance_feedback";
-                door.refuse(path, served, "abort_safe, which this server does not serve yet")
+                door.refuse(path, METHODS, "abort_safe, which this server does not serve yet")
             }
         }
     }
@@ -176,6 +189,7 @@ fn wired(method: Method) -> &'static dyn AnyMethod {
     match method {
         Method::VariableHorizon => &Of::<VariableHorizon>(PhantomData),
         Method::DisturbanceFeedback => &Of::<DisturbanceFeedback>(PhantomData),
+        Method::OfflineSampling => &Of::<OfflineSampling>(PhantomData),
     }
 }
 
@@ -193,7 +207,8 @@ impl Problem {
         Some(match message.method.as_ref()? {
             Message::VariableHorizon(_) => VariableHorizon::PLANNING,
             Message::DisturbanceFeedback(_) => DisturbanceFeedback::PLANNING,
-            Message::AbortSafe(_) | Message::OfflineSampling(_) => return None,
+            Message::OfflineSampling(_) => OfflineSampling::PLANNING,
+            Message::AbortSafe(_) => return None,
         })
     }
 
@@ -366,6 +381,11 @@ impl Step {
         self.0.certificate()
     }
 
+    /// Whether a command may leave: its proof holds, or it says itself that it promises nothing.
+    pub(crate) fn may_leave(&self) -> bool {
+        self.0.may_leave()
+    }
+
     /// What the solvers did.
     pub(crate) fn work(&self) -> SolverWork {
         self.0.work()
@@ -506,7 +526,7 @@ impl<M: Wired> AnyArtifact for Made<M> {
             return Err(StepError::State("it belongs to another method".to_owned()));
         };
         let measurement =
-            M::measurement(measured).map_err(|fault| StepError::Measurement(vec![fault]))?;
+            M::measurement(&self.0, measured).map_err(|fault| StepError::Measurement(vec![fault]))?;
         let answer = M::step(&self.0, state, &measurement, budget)?;
         Ok(Box::new(Decided { by: self, answer }))
     }
@@ -562,6 +582,7 @@ trait AnyStep: fmt::Debug + Send + Sync {
     fn next(&self) -> State;
     fn kind(&self) -> VerdictKind;
     fn certificate(&self) -> Option<&Certificate>;
+    fn may_leave(&self) -> bool;
     fn work(&self) -> SolverWork;
     fn render(&self, omit_prediction: bool) -> v1::StepResponse;
 }
@@ -589,6 +610,10 @@ impl<M: Wired> AnyStep for Decided<M> {
 
     fn certificate(&self) -> Option<&Certificate> {
         M::certificate(&self.answer)
+    }
+
+    fn may_leave(&self) -> bool {
+        M::may_leave(&self.answer)
     }
 
     fn work(&self) -> SolverWork {

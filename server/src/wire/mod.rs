@@ -9,6 +9,7 @@ mod controller_state;
 mod disturbance_feedback;
 mod export;
 mod methods;
+mod offline_sampling;
 mod orbits;
 mod types;
 mod variable_horizon;

@@ -49,7 +49,9 @@ mod terminal;
 mod tube;
 
 pub use artifact::{Artifact, GroupSummary, RowOrigin, Summary, TubeSummary};
-pub use problem::{CostWeights, GainChoice, Problem, Redundancy, SampleChoice, Scheme};
+pub use problem::{
+    Coordinates, CostWeights, GainChoice, Problem, Redundancy, SampleChoice, Scheme,
+};
 pub use sampled::Shard;
 pub use state::State;
 pub use step::{Branch, Command, Diagnostics, Measurement, Step, Verdict};
