@@ -57,7 +57,7 @@ impl Design {
         (state, input): (HalfSpaces, HalfSpaces),
         budget: Budget<'_>,
     ) -> Result<Self, PrepareError> {
-        check_stable(&vertices, &gain)?;
+        check_stable(problem, &vertices, &gain)?;
         let images: Vec<Zonotope> =
             vertices.iter().map(|vertex| disturbance.linear_map(&vertex.b_w)).collect();
         let closed = plant_vertices(&gain, &vertices, &images, false);
@@ -132,16 +132,19 @@ pub(super) fn vertices(problem: &Problem) -> Result<Vec<PlantMatrices>, PrepareE
 
 /// Refuses a gain under which a vertex is not stable, and names every such vertex.
 fn check_stable(
+    problem: &Problem,
     vertices: &[PlantMatrices],
     gain: &DMatrix<f64>,
 ) -> Result<(), PrepareError> {
     let unstable = |(index, vertex): (usize, &PlantMatrices)| {
         let radius = spectral_radius(&(&vertex.a + product(&vertex.b, gain)));
         (!(radius < 1.0)).then(|| {
+            let given = problem.vertices.as_ref().is_some_and(|given| !given.is_empty());
+            let field = if given { format!("vertices[{index}]") } else { "gain".into() };
             let expected = "a gain that stabilises every vertex of the plant";
             let got =
                 format!("spectral radius {radius} at vertex {index} of {} from 0", vertices.len());
-            Fault::new("gain", expected, got)
+            Fault::new(field, expected, got)
         })
     };
     let faults: Vec<Fault> = vertices.iter().enumerate().filter_map(unstable).collect();
@@ -183,10 +186,7 @@ fn plant_vertices<'a>(
 
 /// Q, R, and P with equality in [Mammarella2019, eq. 3]: over samples of the plant, or for the
 /// expected plant where nothing is sampled.
-fn weights(
-    problem: &Problem,
-    gain: &DMatrix<f64>,
-) -> Result<StageWeights, PrepareError> {
+fn weights(problem: &Problem, gain: &DMatrix<f64>) -> Result<StageWeights, PrepareError> {
     let closed_loop = |step: PlantMatrices| step.a + product(&step.b, gain);
     let sampled = |sample: usize| {
         let mut stream = Stream::new(problem.seed, TERMINAL_STREAM, sample as u64);

@@ -62,6 +62,19 @@ use crate::budget::Budget;
 /// Version of the mathematics: raised when the same problem can give different bytes.
 pub const VERSION: &str = "1";
 
+/// Everything that can be said against a problem before anything is sampled: faults, a gain that
+/// does not stabilise, a terminal set or tube that does not exist.
+///
+/// # Errors
+/// As [`Controller::run_shard`].
+pub fn check(problem: &Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+    match problem.scheme {
+        Scheme::OfflineSampling => sampled::check(problem, budget),
+        Scheme::LinearQuadratic => nominal::prepare(problem, budget).map(drop),
+        Scheme::TubeRobust => tube::prepare(problem, budget).map(drop),
+    }
+}
+
 /// The method, as a [`Controller`].
 #[derive(Debug, Clone, Copy)]
 pub struct OfflineSampling;

@@ -23,8 +23,7 @@ pub(super) fn prepare(problem: &Problem, budget: Budget<'_>) -> Result<Artifact,
     let cost = nominal.cost(&design.weights);
     let (rows, groups) = nominal.rows(&design.constraints, &design.groups);
     let none = HalfSpaces::new(rows.dimension());
-    let reduction =
-        irredundant(&rows, &none, EXACT, budget).map_err(|reason| no_set(&reason))?;
+    let reduction = irredundant(&rows, &none, EXACT, budget).map_err(|reason| no_set(&reason))?;
     let kept: Vec<StageGroup> = reduction.kept.iter().map(|&row| groups[row]).collect();
     let mut summary = design.summary(summaries(&design.groups, &groups, &kept));
     summary.doubtful_rows = reduction.doubtful;
@@ -70,7 +69,8 @@ impl Nominal {
         let mut rows = HalfSpaces::new(self.prediction.states[0].ncols() - 1);
         let mut origins = Vec::new();
         for &group in groups {
-            constraints.push_rows(group, &self.prediction, &mut rows);
+            let faces: Vec<usize> = (0..constraints.of(group.family).len()).collect();
+            constraints.push_rows(group, &faces, &self.prediction, &mut rows);
             origins.resize(rows.len(), group);
         }
         (rows, origins)

@@ -264,7 +264,7 @@ impl Problem {
             && !(epsilon > 0.0 && epsilon < 1.0)
         {
             let got = epsilon.to_string();
-            faults.push(Fault::new("redundancy.epsilon", "between 0 and 1", got));
+            faults.push(Fault::new("redundancy.inner_scaled.epsilon", "between 0 and 1", got));
         }
         faults
     }

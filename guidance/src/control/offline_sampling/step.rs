@@ -252,11 +252,8 @@ impl<'a> Present<'a> {
         for (v, (u, w)) in decisions.iter_mut().zip(input.iter().zip(wanted.iter())) {
             *v += u - w;
         }
-        let flown = QuadraticSolution {
-            point: decisions.clone(),
-            active: Vec::new(),
-            ..solution.clone()
-        };
+        let flown =
+            QuadraticSolution { point: decisions.clone(), active: Vec::new(), ..solution.clone() };
         let certificate = certify(artifact, program, &flown, self.x, Claim::PreviousPlanTail);
         diagnostics.branch = Branch::PreviousPlanTail;
         diagnostics.expected_cost = Some(certificate.cost);

@@ -7,9 +7,7 @@ use crate::{
     budget::Budget,
     control::{ConstraintFamily, Fault, Infeasibility, PrepareError, Relaxation},
     matrices::product,
-    reach::{
-        HalfSpaces, Invariant, InvariantLimits, PlantVertex, max_robust_positive_invariant,
-    },
+    reach::{HalfSpaces, Invariant, InvariantLimits, PlantVertex, max_robust_positive_invariant},
 };
 
 /// Terms of the sum of a disturbance's images are below this share of the sum when it stops.
@@ -64,7 +62,11 @@ pub(super) fn terminal_set(
 }
 
 /// State rows, then input rows with u = K x, over x.
-pub(super) fn fed_back_rows(state: &HalfSpaces, input: &HalfSpaces, gain: &DMatrix<f64>) -> HalfSpaces {
+pub(super) fn fed_back_rows(
+    state: &HalfSpaces,
+    input: &HalfSpaces,
+    gain: &DMatrix<f64>,
+) -> HalfSpaces {
     let mut rows = state.clone();
     for row in 0..input.len() {
         let normal = DMatrix::from_row_slice(1, gain.nrows(), input.normal(row));
@@ -132,7 +134,8 @@ fn taken_by_disturbance(rows: &HalfSpaces, closed: &[PlantVertex<'_>]) -> Vec<f6
         let mut direction = DVector::from_column_slice(rows.normal(row));
         let mut sum = 0.0;
         for _ in 0..SERIES_TERMS_MAX {
-            let support = |vertex: &PlantVertex<'_>| vertex.disturbance.support_function(&direction);
+            let support =
+                |vertex: &PlantVertex<'_>| vertex.disturbance.support_function(&direction);
             let term = closed.iter().map(support).fold(0.0, f64::max);
             sum += term;
             if term <= SERIES_SHARE * sum {

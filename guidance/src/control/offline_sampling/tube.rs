@@ -63,8 +63,7 @@ pub(super) fn prepare(problem: &Problem, budget: Budget<'_>) -> Result<Artifact,
         rows.push(&normal, tube.set.offset(row));
     }
     let none = HalfSpaces::new(rows.dimension());
-    let reduction =
-        irredundant(&rows, &none, EXACT, budget).map_err(|reason| no_set(&reason))?;
+    let reduction = irredundant(&rows, &none, EXACT, budget).map_err(|reason| no_set(&reason))?;
     let origin = |row: &usize| groups.get(*row).map_or(RowOrigin::Tube, |&g| RowOrigin::Stage(g));
     let kept: Vec<StageGroup> =
         reduction.kept.iter().filter_map(|&row| groups.get(row).copied()).collect();
@@ -221,9 +220,8 @@ fn lumped_disturbance(
     let w = disturbance(problem);
     let sets = [("state_set", &problem.state_set), ("input_set", &problem.input_set)];
     let differs = vertices.iter().any(|vertex| vertex.a != mean.a || vertex.b != mean.b);
-    let [states, inputs] = sets.map(|(field, set)| {
-        if differs { corners(field, set, budget) } else { Ok(Vec::new()) }
-    });
+    let [states, inputs] =
+        sets.map(|(field, set)| if differs { corners(field, set, budget) } else { Ok(Vec::new()) });
     let (states, inputs) = (states?, inputs?);
     let (n, _) = problem.dimensions();
     let mut half = DVector::<f64>::zeros(n);
