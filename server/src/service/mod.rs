@@ -462,9 +462,9 @@ impl Service {
         if self.cache.get(&(Shelf::Artifacts, id)).is_some() {
             return Ok(Timed { value: (id, method), compute: Duration::ZERO });
         }
-        let work = move |budget: Budget<'_>| match problem.prepare(budget) {
+        let work = move |budget: Budget<'_>| match problem.check(budget) {
             // That no controller exists is an answer to the request, not a fault in it.
-            Ok(_) | Err(PrepareError::Infeasible(_)) => Ok(()),
+            Ok(()) | Err(PrepareError::Infeasible(_)) => Ok(()),
             Err(fault) => Err(Error::prepare(&problem_path(method), fault)),
         };
         let timed = self.compute.run("validate", call.deadline, work).await?;

@@ -43,6 +43,12 @@ pub(super) trait Wired:
     fn canonical_bytes(problem: &Self::Problem) -> Vec<u8>;
     /// Units of the amounts by which constraints are missed.
     fn units(problem: &Self::Problem) -> types::Units;
+    /// Finds every fault that only the mathematics sees: a whole precompute, unless the method
+    /// knows a shorter way.
+    fn check(problem: &Self::Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+        let shards = (0..Self::shards(problem)).map(|i| Self::run_shard(problem, i, budget));
+        Self::merge(problem, shards.collect::<Result<_, _>>()?, budget).map(drop)
+    }
 
     /// The problem an artifact was made for.
     fn problem(artifact: &Self::Artifact) -> &Self::Problem;
@@ -251,6 +257,11 @@ impl Problem {
         self.merge(shards.collect::<Result<_, _>>()?, budget)
     }
 
+    /// Finds every fault that only the mathematics sees, and makes nothing.
+    pub(crate) fn check(&self, budget: Budget<'_>) -> Result<(), PrepareError> {
+        self.0.check(budget)
+    }
+
     /// Writes why no artifact can be made.
     pub(super) fn render_infeasible(&self, why: &Infeasibility) -> v1::Infeasible {
         types::render_infeasible(why, self.0.units())
@@ -419,6 +430,7 @@ trait AnyProblem: fmt::Debug + Send + Sync {
     fn method(&self) -> Method;
     fn canonical_bytes(&self) -> Vec<u8>;
     fn units(&self) -> types::Units;
+    fn check(&self, budget: Budget<'_>) -> Result<(), PrepareError>;
     fn shards(&self) -> usize;
     fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Shard, PrepareError>;
     fn merge(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<Artifact, PrepareError>;
@@ -444,6 +456,10 @@ impl<M: Wired> AnyProblem for Asked<M> {
 
     fn units(&self) -> types::Units {
         M::units(&self.0)
+    }
+
+    fn check(&self, budget: Budget<'_>) -> Result<(), PrepareError> {
+        M::check(&self.0, budget)
     }
 
     fn shards(&self) -> usize {

@@ -3,9 +3,9 @@
 use nalgebra::{DMatrix, DVector};
 use sha2::{Digest, Sha256};
 use vbar_guidance::{
-    Method,
+    Budget, Method,
     control::{
-        Certificate, Fault,
+        Certificate, Fault, PrepareError,
         offline_sampling::{
             self as method, Artifact, Branch, Command, Coordinates, GroupSummary, OfflineSampling,
             Redundancy, Scheme, Step, TubeSummary, Verdict,
@@ -34,6 +34,10 @@ impl Wired for OfflineSampling {
     fn units(_: &method::Problem) -> Units {
         // Rows are over state and corrections together: their margins are no lengths.
         Units::scaled(None)
+    }
+
+    fn check(problem: &method::Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+        method::check(problem, budget)
     }
 
     fn problem(artifact: &Artifact) -> &method::Problem {
