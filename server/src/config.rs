@@ -164,6 +164,8 @@ impl Config {
         count("limits.polytope_rows_max", self.limits.polytope_rows_max, 100_000);
         count("limits.plan_instants_max", self.limits.plan_instants_max, PLAN_INSTANTS_MAX);
         count("limits.report_states_max", self.limits.report_states_max, 1_000_000);
+        count("limits.sampled_rows_max", self.limits.sampled_rows_max, 100_000_000);
+        count("limits.plant_vertices_max", self.limits.plant_vertices_max, 4096);
         let mut time = |setting, value: Duration, (least, most): (Duration, Duration)| {
             let expected = format!("{least:?} to {most:?}");
             check((least..=most).contains(&value), setting, &expected, format!("{value:?}"));
@@ -223,6 +225,8 @@ pub struct Settings {
     pub polytope_rows_max: Option<usize>,
     pub plan_instants_max: Option<usize>,
     pub report_states_max: Option<usize>,
+    pub sampled_rows_max: Option<usize>,
+    pub plant_vertices_max: Option<usize>,
 }
 
 /// Why a source of configuration could not be read.
@@ -274,7 +278,9 @@ macro_rules! for_each_setting {
             steps_max,
             polytope_rows_max,
             plan_instants_max,
-            report_states_max
+            report_states_max,
+            sampled_rows_max,
+            plant_vertices_max
         )
     };
 }
@@ -416,6 +422,10 @@ impl Settings {
                 report_states_max: self
                     .report_states_max
                     .unwrap_or(config.limits.report_states_max),
+                sampled_rows_max: self.sampled_rows_max.unwrap_or(config.limits.sampled_rows_max),
+                plant_vertices_max: self
+                    .plant_vertices_max
+                    .unwrap_or(config.limits.plant_vertices_max),
             },
         };
         if faults.is_empty() { Ok(applied) } else { Err(SettingsError::Durations(faults)) }

@@ -22,11 +22,14 @@ pub enum Method {
     DisturbanceFeedback,
     /// Rendezvous that can be aborted at every step.
     AbortSafe,
+    /// Stochastic MPC sampled offline, and its baselines.
+    OfflineSampling,
 }
 
 impl Method {
     /// Every method.
-    pub const ALL: [Self; 3] = [Self::VariableHorizon, Self::DisturbanceFeedback, Self::AbortSafe];
+    pub const ALL: [Self; 4] =
+        [Self::VariableHorizon, Self::DisturbanceFeedback, Self::AbortSafe, Self::OfflineSampling];
 
     /// Name on the wire and in identifiers.
     #[must_use]
@@ -35,6 +38,7 @@ impl Method {
             Self::VariableHorizon => "variable_horizon",
             Self::DisturbanceFeedback => "disturbance_feedback",
             Self::AbortSafe => "abort_safe",
+            Self::OfflineSampling => "offline_sampling",
         }
     }
 
@@ -45,13 +49,14 @@ impl Method {
             Self::VariableHorizon => variable_horizon::VERSION,
             Self::DisturbanceFeedback => disturbance_feedback::VERSION,
             Self::AbortSafe => abort_safe::VERSION,
+            Self::OfflineSampling => offline_sampling::VERSION,
         }
     }
 }
 
 /// Folders of methods whose mathematics stands here and that no node serves yet: contract, wire and
 /// missions are to come. A served method leaves this list for [`Method`]; `tidy` knows both.
-pub const NOT_YET_SERVED: [&str; 1] = ["offline_sampling"];
+pub const NOT_YET_SERVED: [&str; 0] = [];
 
 /// A method: think long once (`prepare` in shards, then `merge`), then decide fast many times.
 ///

@@ -242,8 +242,8 @@ impl Service {
         let timed = self.compute.run("plan", call.deadline, work).await?;
         let (verdict, kept) = timed.value?;
         self.count(verdict.work);
-        if verdict.certificate.is_some() {
-            self.withhold_unless_passed(verdict.certificate.as_ref())?;
+        if let Some(certificate) = &verdict.certificate {
+            self.withhold_unless(certificate.passed, Some(certificate))?;
         }
         self.planned(if verdict.is_infeasible() { "infeasible" } else { "computed" });
         let plan_id = kept.map(|plan| self.shelves.remember(Shelf::Plans, plan).id);
@@ -366,7 +366,7 @@ impl Service {
             VerdictKind::Infeasible => "infeasible",
         };
         if answer.step.kind() == VerdictKind::Command {
-            self.withhold_unless_passed(answer.step.certificate())?;
+            self.withhold_unless(answer.step.may_leave(), answer.step.certificate())?;
         }
         self.metrics.verdicts.get_or_create(&OutcomeLabels { outcome }).inc();
         Ok(Timed { value: answer, compute: timed.compute })
@@ -462,9 +462,9 @@ impl Service {
         if self.shelves.cache.get(&(Shelf::Artifacts, id)).is_some() {
             return Ok(Timed { value: (id, method), compute: Duration::ZERO });
         }
-        let work = move |budget: Budget<'_>| match problem.prepare(budget) {
+        let work = move |budget: Budget<'_>| match problem.check(budget) {
             // That no controller exists is an answer to the request, not a fault in it.
-            Ok(_) | Err(PrepareError::Infeasible(_)) => Ok(()),
+            Ok(()) | Err(PrepareError::Infeasible(_)) => Ok(()),
             Err(fault) => Err(Error::prepare(&problem_path(method), fault)),
         };
         let timed = self.compute.run("validate", call.deadline, work).await?;
@@ -472,9 +472,13 @@ impl Service {
         Ok(Timed { value: (id, method), compute: timed.compute })
     }
 
-    /// An answer whose certificate did not pass never leaves as an answer.
-    fn withhold_unless_passed(&self, certificate: Option<&Certificate>) -> Result<(), Error> {
-        if certificate.is_some_and(|certificate| certificate.passed) {
+    /// An answer whose certificate did not pass never leaves as a proved answer.
+    fn withhold_unless(
+        &self,
+        may_leave: bool,
+        certificate: Option<&Certificate>,
+    ) -> Result<(), Error> {
+        if may_leave {
             return Ok(());
         }
         self.metrics.certificate_failures.inc();

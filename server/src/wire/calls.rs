@@ -389,6 +389,8 @@ impl Render for InfoAnswer {
                 polytope_rows_max: count(self.limits.polytope_rows_max),
                 plan_instants_max: count(self.limits.plan_instants_max),
                 report_states_max: count(self.limits.report_states_max),
+                sampled_rows_max: count(self.limits.sampled_rows_max),
+                plant_vertices_max: count(self.limits.plant_vertices_max),
                 concurrent_computations_max: count(self.compute_threads),
                 computation_time_max_s: self.computation_time_max.as_secs_f64(),
             }),

@@ -11,6 +11,7 @@ mod controller_state;
 mod disturbance_feedback;
 mod export;
 mod methods;
+mod offline_sampling;
 mod operations;
 mod orbits;
 mod paging;
@@ -66,6 +67,10 @@ pub struct Limits {
     pub plan_instants_max: usize,
     /// Most states of a safety report.
     pub report_states_max: usize,
+    /// Most rows that samples may make.
+    pub sampled_rows_max: usize,
+    /// Most vertices of an uncertain plant.
+    pub plant_vertices_max: usize,
 }
 
 impl Default for Limits {
@@ -81,6 +86,8 @@ impl Default for Limits {
             polytope_rows_max: 64,
             plan_instants_max: PLAN_INSTANTS_MAX,
             report_states_max: 2000,
+            sampled_rows_max: 2_000_000,
+            plant_vertices_max: 64,
         }
     }
 }

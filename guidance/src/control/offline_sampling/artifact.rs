@@ -74,10 +74,11 @@ pub struct Summary {
     /// Largest certified excess of a removed row, relative; with `InnerScaled` the kept rows were
     /// moved inwards by it.
     pub outer_excess: f64,
-    /// Extreme points of the kept rows at which every sampled row was looked at.
+    /// Extreme points of kept rows, before they were moved, at which the removed ones were looked
+    /// at: those of each part of a group, and those of all parts together.
     pub checked_points: usize,
-    /// Largest violation of any sampled row there, relative to its distance from the inner point
-    /// of the set: rounding, or something is wrong.
+    /// Largest violation of a removed row at any of them, relative; it must not be larger than
+    /// `outer_excess`, which comes from certificates.
     pub checked_excess: f64,
     /// Rows of the first-step set's program that the others do not imply.
     pub first_step_rows: usize,

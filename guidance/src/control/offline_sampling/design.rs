@@ -57,7 +57,7 @@ impl Design {
         (state, input): (HalfSpaces, HalfSpaces),
         budget: Budget<'_>,
     ) -> Result<Self, PrepareError> {
-        check_stable(&vertices, &gain)?;
+        check_stable(problem, &vertices, &gain)?;
         let images: Vec<Zonotope> =
             vertices.iter().map(|vertex| disturbance.linear_map(&vertex.b_w)).collect();
         let closed = plant_vertices(&gain, &vertices, &images, false);
@@ -131,14 +131,20 @@ pub(super) fn vertices(problem: &Problem) -> Result<Vec<PlantMatrices>, PrepareE
 }
 
 /// Refuses a gain under which a vertex is not stable, and names every such vertex.
-fn check_stable(vertices: &[PlantMatrices], gain: &DMatrix<f64>) -> Result<(), PrepareError> {
+fn check_stable(
+    problem: &Problem,
+    vertices: &[PlantMatrices],
+    gain: &DMatrix<f64>,
+) -> Result<(), PrepareError> {
     let unstable = |(index, vertex): (usize, &PlantMatrices)| {
         let radius = spectral_radius(&(&vertex.a + product(&vertex.b, gain)));
         (!(radius < 1.0)).then(|| {
+            let given = problem.vertices.as_ref().is_some_and(|given| !given.is_empty());
+            let field = if given { format!("vertices[{index}]") } else { "gain".into() };
             let expected = "a gain that stabilises every vertex of the plant";
             let got =
                 format!("spectral radius {radius} at vertex {index} of {} from 0", vertices.len());
-            Fault::new("gain", expected, got)
+            Fault::new(field, expected, got)
         })
     };
     let faults: Vec<Fault> = vertices.iter().enumerate().filter_map(unstable).collect();

@@ -1,8 +1,8 @@
 //! Canonical bytes of a problem: equal problems, equal bytes; also how artifacts keep them.
 
 use super::{
-    CostWeights, GainChoice, GroupSummary, Problem, Redundancy, RowOrigin, SampleChoice, Scheme,
-    Summary, TubeSummary, artifact::Parts,
+    Coordinates, CostWeights, GainChoice, GroupSummary, Problem, Redundancy, RowOrigin,
+    SampleChoice, Scheme, Summary, TubeSummary, artifact::Parts,
 };
 use crate::{
     bytes::{DecodeError, Reader, Writer},
@@ -29,6 +29,11 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
         Scheme::TubeRobust => 3,
     });
     write_plant(writer, &problem.plant);
+    writer.tag(match problem.coordinates {
+        Coordinates::General => 1,
+        Coordinates::Planar => 2,
+        Coordinates::Rtn => 3,
+    });
     writer.option(problem.vertices.as_ref(), |writer, vertices| {
         writer.count(vertices.len());
         for vertex in vertices {
@@ -88,6 +93,12 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         other => return Err(unknown(reader, "scheme", other)),
     };
     let plant = read_plant(reader)?;
+    let coordinates = match reader.tag()? {
+        1 => Coordinates::General,
+        2 => Coordinates::Planar,
+        3 => Coordinates::Rtn,
+        other => return Err(unknown(reader, "coordinates", other)),
+    };
     let vertices = reader.option(|reader| {
         let count = reader.count()?;
         let vertex = |reader: &mut Reader<'_>| -> Result<PlantMatrices, DecodeError> {
@@ -128,6 +139,7 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
     Ok(Problem {
         scheme,
         plant,
+        coordinates,
         vertices,
         disturbance,
         horizon,

@@ -49,7 +49,9 @@ mod terminal;
 mod tube;
 
 pub use artifact::{Artifact, GroupSummary, RowOrigin, Summary, TubeSummary};
-pub use problem::{CostWeights, GainChoice, Problem, Redundancy, SampleChoice, Scheme};
+pub use problem::{
+    Coordinates, CostWeights, GainChoice, Problem, Redundancy, SampleChoice, Scheme,
+};
 pub use sampled::Shard;
 pub use state::State;
 pub use step::{Branch, Command, Diagnostics, Measurement, Step, Verdict};
@@ -59,6 +61,19 @@ use crate::budget::Budget;
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
 pub const VERSION: &str = "1";
+
+/// Everything that can be said against a problem before anything is sampled: faults, a gain that
+/// does not stabilise, a terminal set or tube that does not exist.
+///
+/// # Errors
+/// As [`Controller::run_shard`].
+pub fn check(problem: &Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+    match problem.scheme {
+        Scheme::OfflineSampling => sampled::check(problem, budget),
+        Scheme::LinearQuadratic => nominal::prepare(problem, budget).map(drop),
+        Scheme::TubeRobust => tube::prepare(problem, budget).map(drop),
+    }
+}
 
 /// The method, as a [`Controller`].
 #[derive(Debug, Clone, Copy)]

@@ -69,7 +69,8 @@ impl Nominal {
         let mut rows = HalfSpaces::new(self.prediction.states[0].ncols() - 1);
         let mut origins = Vec::new();
         for &group in groups {
-            constraints.push_rows(group, &self.prediction, &mut rows);
+            let faces: Vec<usize> = (0..constraints.of(group.family).len()).collect();
+            constraints.push_rows(group, &faces, &self.prediction, &mut rows);
             origins.resize(rows.len(), group);
         }
         (rows, origins)

@@ -17,6 +17,8 @@ pub struct Problem {
     pub scheme: Scheme,
     /// What is controlled.
     pub plant: UncertainPlant,
+    /// What the components of its state and input are.
+    pub coordinates: Coordinates,
     /// Plants whose hull holds every plant; `None`: the corners of the parameters' box.
     pub vertices: Option<Vec<PlantMatrices>>,
     /// Law of each component of w.
@@ -42,6 +44,18 @@ pub struct Problem {
     pub first_step: Option<GrowthLimits>,
     /// All chance follows from this.
     pub seed: u64,
+}
+
+/// What the components of state and input are. The mathematics is the same; whoever measures and
+/// thrusts has to know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Coordinates {
+    /// Anything.
+    General,
+    /// State [x, y, x', y'] in m and m/s in a plane at rest, input force in N.
+    Planar,
+    /// State position and velocity in RTN in m and m/s, input force in N.
+    Rtn,
 }
 
 /// Which controller: the method, or one of the two that [Mammarella2019, table III] compares it
@@ -250,7 +264,7 @@ impl Problem {
             && !(epsilon > 0.0 && epsilon < 1.0)
         {
             let got = epsilon.to_string();
-            faults.push(Fault::new("redundancy.epsilon", "between 0 and 1", got));
+            faults.push(Fault::new("redundancy.inner_scaled.epsilon", "between 0 and 1", got));
         }
         faults
     }

@@ -10,8 +10,8 @@ use crate::{
     control::{Failure, Fault, PrepareError},
     dynamics::ExpectedCost,
     reach::{
-        EXACT, Growth, GrowthError, GrowthLimits, HalfSpaces, SampledRows, Scenario,
-        grow_control_invariant, irredundant, step_back,
+        EXACT, GroupPart, Growth, GrowthError, GrowthLimits, HalfSpaces, SampledRows, Scenario,
+        StageFamily, StageGroup, Survivors, grow_control_invariant, irredundant, step_back,
     },
     sampling::failure_of_any,
 };
@@ -23,7 +23,7 @@ const COST_STREAM: u64 = u64::MAX;
 #[derive(Debug, Clone, PartialEq)]
 pub enum Shard {
     /// The rows of one part of a group that are needed beside the context.
-    Rows(SampledRows),
+    Rows(Survivors),
     /// The expected cost.
     Cost(ExpectedCost),
     /// Everything: the baselines take milliseconds.
@@ -76,9 +76,42 @@ impl<'a> Sampling<'a> {
     }
 }
 
-/// One a sampled group, and one for the expected cost.
+/// What rounding may add to a removed row at an extreme point, relative.
+const CHECK_TOLERANCE: f64 = 1e-7;
+
+/// A terminal set has more faces than the others, and its rows have all variables: it is cut up,
+/// so that no shard is much longer than the rest.
+const TERMINAL_PARTS: usize = 6;
+
+/// What each shard but the last reduces: the long ones first.
+fn parts(problem: &Problem) -> Vec<GroupPart> {
+    let groups = problem.groups();
+    let parts = |(group, stage_group): (usize, &StageGroup)| {
+        let stride = if stage_group.family == StageFamily::Terminal { TERMINAL_PARTS } else { 1 };
+        (0..stride).map(move |first| GroupPart { group, first, stride })
+    };
+    groups.iter().enumerate().rev().flat_map(parts).collect()
+}
+
+/// Tolerances of a part's reduction and of the last one.
+fn tolerances(redundancy: Redundancy) -> (f64, f64) {
+    match redundancy {
+        Redundancy::Exact => (EXACT, EXACT),
+        Redundancy::InnerScaled { epsilon } => {
+            let part = 0.5 * epsilon;
+            (part, (1.0 + epsilon) / (1.0 + part) - 1.0)
+        }
+    }
+}
+
+/// One a part, and one for the expected cost.
 pub(super) fn shards(problem: &Problem) -> usize {
-    problem.groups().len() + 1
+    parts(problem).len() + 1
+}
+
+/// Faults, stability, terminal set and number of rows.
+pub(super) fn check(problem: &Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+    Sampling::new(problem, budget).map(drop)
 }
 
 pub(super) fn run_shard(
@@ -88,11 +121,12 @@ pub(super) fn run_shard(
 ) -> Result<Shard, PrepareError> {
     let sampling = Sampling::new(problem, budget.untold())?;
     let scenario = sampling.scenario();
-    if shard >= sampling.sizes.len() {
+    let Some(&part) = parts(problem).get(shard) else {
         return sampling.cost(budget).map(Shard::Cost);
-    }
+    };
     let context = scenario.context(budget.untold()).map_err(|reason| no_set(&reason))?;
-    let rows = scenario.survivors(shard, &context, budget);
+    let (tolerance, _) = tolerances(problem.redundancy);
+    let rows = scenario.survivors(part, &context, tolerance, budget);
     rows.map(Shard::Rows).map_err(|reason| no_set(&reason))
 }
 
@@ -112,19 +146,22 @@ pub(super) fn merge(
             Shard::Whole(_) => {}
         }
     }
-    let (Some(cost), true) = (cost, survivors.len() == sampling.sizes.len()) else {
+    let (Some(cost), true) = (cost, survivors.len() == parts(problem).len()) else {
         return Err(Failure::Numerical("shards are missing".into()).into());
     };
-    let tolerance = match problem.redundancy {
-        Redundancy::Exact => EXACT,
-        Redundancy::InnerScaled { epsilon } => epsilon,
-    };
     let context = scenario.context(budget.untold()).map_err(|reason| no_set(&reason))?;
-    let (sampled, reduction) = Scenario::merged(&context, &survivors, tolerance, budget)
+    let (_, tolerance) = tolerances(problem.redundancy);
+    let merged = Scenario::merged(&context, &survivors, tolerance, budget)
         .map_err(|reason| no_set(&reason))?;
-    let mut summary = sampling.design.summary(groups(&scenario, &sampled));
-    summary.doubtful_rows = reduction.doubtful;
-    summary.outer_excess = reduction.outer_excess;
+    if merged.check.excess > merged.outer_excess + CHECK_TOLERANCE {
+        let text = format!("a removed row is violated by {:.3e}", merged.check.excess);
+        return Err(Failure::Numerical(text).into());
+    }
+    let mut summary = sampling.design.summary(groups(&scenario, &merged.rows));
+    summary.doubtful_rows = merged.doubtful;
+    summary.outer_excess = merged.outer_excess;
+    summary.checked_points = merged.check.points;
+    summary.checked_excess = merged.check.excess;
     if problem.sampled_by_the_bound() {
         let claims = problem.claims(summary.terminal_rows);
         let delta = problem.samples.confidence_complement;
@@ -133,8 +170,11 @@ pub(super) fn merge(
     let origin = |&group: &usize| RowOrigin::Stage(sampling.design.groups[group]);
     let mut parts = Parts {
         problem: problem.clone(),
-        origins: sampled.groups.iter().map(origin).collect(),
-        rows: sampled.rows,
+        origins: merged.rows.groups.iter().map(origin).collect(),
+        rows: match problem.redundancy {
+            Redundancy::Exact => merged.rows.rows,
+            Redundancy::InnerScaled { .. } => merged.inner(&context.centre),
+        },
         summary,
         cost,
         terminal_set: sampling.design.constraints.terminal.clone(),
