@@ -80,13 +80,14 @@ pub trait Controller {
         budget: Budget<'_>,
     ) -> Result<Self::Shard, PrepareError>;
 
-    /// Puts shards, in their order, together.
+    /// Puts shards, in their order, together; this can be long work too.
     ///
     /// # Errors
     /// As [`Controller::run_shard`].
     fn merge(
         problem: &Self::Problem,
         shards: Vec<Self::Shard>,
+        budget: Budget<'_>,
     ) -> Result<Self::Artifact, PrepareError>;
 
     /// The state before the first step.

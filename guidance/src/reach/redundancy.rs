@@ -54,14 +54,8 @@ impl Reduction {
     /// every point satisfies the removed rows too.
     #[must_use]
     pub fn inner(&self, candidates: &HalfSpaces) -> HalfSpaces {
-        let mut inner = HalfSpaces::new(candidates.dimension());
-        for &row in &self.kept {
-            let normal = candidates.normal(row);
-            let at: f64 = normal.iter().zip(&self.interior.point).map(|(a, z)| a * z).sum();
-            let room = candidates.offset(row) - at;
-            inner.push(normal, at + room / (1.0 + self.outer_excess));
-        }
-        inner
+        let kept = candidates.select(&self.kept);
+        kept.towards(&self.interior.point, 1.0 / (1.0 + self.outer_excess))
     }
 }
 
@@ -81,14 +75,47 @@ pub fn irredundant(
     let mut all = candidates.clone();
     all.extend(context);
     let interior = all.interior_point(budget)?;
-    let mut search = Search::new(&all, candidates.len(), &interior, tolerance)?;
-    if !context.is_empty() && candidates.len() > DOMINANCE_WORTHWHILE {
+    reduce(candidates.len(), &all, interior, tolerance, budget)
+}
+
+/// [`irredundant`], with rows measured about a point of the caller. Reductions about the same
+/// point add up: what one removes within 1 + epsilon and the next within 1 + epsilon' of what the
+/// first had left holds within (1 + epsilon)(1 + epsilon').
+///
+/// # Errors
+/// [`NoInterior::Numerical`] if the point does not lie inside all rows.
+pub fn irredundant_about(
+    point: &InteriorPoint,
+    candidates: &HalfSpaces,
+    context: &HalfSpaces,
+    tolerance: f64,
+    budget: Budget<'_>,
+) -> Result<Reduction, NoInterior> {
+    let mut all = candidates.clone();
+    all.extend(context);
+    if !(all.room(&point.point) > 0.0) {
+        return Err(NoInterior::Numerical);
+    }
+    reduce(candidates.len(), &all, point.clone(), tolerance, budget)
+}
+
+/// The first `candidates` rows are to be decided, the others stay.
+fn reduce(
+    candidates: usize,
+    all: &HalfSpaces,
+    interior: InteriorPoint,
+    tolerance: f64,
+    budget: Budget<'_>,
+) -> Result<Reduction, NoInterior> {
+    let mut search = Search::new(all, candidates, &interior, tolerance)?;
+    if candidates < all.len() && candidates > DOMINANCE_WORTHWHILE {
         // Only rows that stay may carry the box, or rows could remove each other.
         search.dominance = Dominance::new(&search.context_rows(), budget)?;
     }
-    for row in 0..candidates.len() {
+    for row in 0..candidates {
         if row % BUDGET_PERIOD == 0 {
             budget.check()?;
+            budget.tell(row, candidates);
         }
         if search.fate[row] == Fate::Open {
             search.decide(row);
@@ -97,7 +124,7 @@ pub fn irredundant(
     if search.ties {
         search.clean_up(budget)?;
     }
-    let kept = (0..candidates.len()).filter(|&row| search.fate[row] == Fate::Needed).collect();
+    let kept = (0..candidates).filter(|&row| search.fate[row] == Fate::Needed).collect();
     Ok(Reduction { kept, interior, outer_excess: search.outer_excess, doubtful: search.doubtful })
 }
 
@@ -206,7 +233,10 @@ impl Search {
             self.fate[row] = Fate::Removed;
             return;
         }
-        if self.dominance.as_mut().is_some_and(|front| front.dominated(&self.polar, row)) {
+        let Self { dominance, polar, tolerance, .. } = self;
+        let behind = dominance.as_mut().and_then(|front| front.excess(polar, row, *tolerance));
+        if let Some(excess) = behind {
+            self.outer_excess = self.outer_excess.max(excess);
             self.fate[row] = Fate::Removed;
             return;
         }
@@ -225,7 +255,7 @@ impl Search {
                     self.needed.push(worst);
                     self.touch(worst);
                     if let Some(front) = &mut self.dominance {
-                        front.add(worst);
+                        front.add(&self.polar, worst);
                     }
                 }
             }

@@ -205,7 +205,7 @@ fn shards_in_any_number_of_hands_give_the_same_bytes() {
         .map(|i| AbortSafe::run_shard(&problem, i, Budget::UNLIMITED).unwrap())
         .collect();
     shards.reverse();
-    let merged = AbortSafe::merge(&problem, shards.clone()).unwrap();
+    let merged = AbortSafe::merge(&problem, shards.clone(), Budget::UNLIMITED).unwrap();
     let bytes = Artifact::prepare(&problem).unwrap().to_bytes();
     assert_eq!(merged.to_bytes(), bytes);
     assert_eq!(Artifact::from_bytes(&bytes).unwrap(), merged);
@@ -214,7 +214,7 @@ fn shards_in_any_number_of_hands_give_the_same_bytes() {
         assert!(Artifact::from_bytes(&bytes[..length]).is_err(), "{length} bytes");
     }
     shards.pop();
-    let error = AbortSafe::merge(&problem, shards).unwrap_err();
+    let error = AbortSafe::merge(&problem, shards, Budget::UNLIMITED).unwrap_err();
     assert!(matches!(error, PrepareError::Failure(_)), "{error:?}");
 }
 

@@ -143,7 +143,7 @@ fn prepare<C: Controller>(
     let shards = (0..C::shards(problem))
         .map(|shard| C::run_shard(problem, shard, budget))
         .collect::<Result<_, _>>()?;
-    C::merge(problem, shards)
+    C::merge(problem, shards, budget)
 }
 
 impl Artifact {

@@ -365,6 +365,8 @@ fn render_family(family: ConstraintFamily) -> i32 {
         ConstraintFamily::InitialState => v1::ConstraintFamily::InitialState,
         ConstraintFamily::EmptyInputSet => v1::ConstraintFamily::EmptyInputSet,
         ConstraintFamily::EmptyStateSet => v1::ConstraintFamily::EmptyStateSet,
+        ConstraintFamily::FirstStep => v1::ConstraintFamily::FirstStep,
+        ConstraintFamily::Tube => v1::ConstraintFamily::Tube,
     };
     family.into()
 }
@@ -399,7 +401,9 @@ fn in_metres(family: ConstraintFamily, amount: f64, position_unit_m: Option<f64>
         ConstraintFamily::Dynamics
         | ConstraintFamily::Input
         | ConstraintFamily::Terminal
-        | ConstraintFamily::EmptyInputSet => None,
+        | ConstraintFamily::EmptyInputSet
+        | ConstraintFamily::FirstStep
+        | ConstraintFamily::Tube => None,
     }
 }
 

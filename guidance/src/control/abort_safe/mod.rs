@@ -105,7 +105,11 @@ impl Controller for AbortSafe {
         artifact::run_shard(problem, shard, budget)
     }
 
-    fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+    fn merge(
+        problem: &Problem,
+        shards: Vec<Shard>,
+        _budget: Budget<'_>,
+    ) -> Result<Artifact, PrepareError> {
         artifact::merge(problem, shards)
     }
 

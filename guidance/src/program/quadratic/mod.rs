@@ -196,6 +196,28 @@ impl DenseRows {
         lanes_dot(&normal[support.clone()], &padded[support])
     }
 
+    /// Largest (z - scale a_i) y over a box of these middles and half widths; all three padded.
+    #[inline]
+    pub(crate) fn reach_of_rest(
+        &self,
+        row: usize,
+        scale: f64,
+        padded: &[f64],
+        (middle, half): (&[f64], &[f64]),
+    ) -> f64 {
+        let normal = &self.normals[row * self.stride..][..self.stride];
+        let (normal, padded) = (normal.chunks_exact(LANES), padded.chunks_exact(LANES));
+        let sides = middle.chunks_exact(LANES).zip(half.chunks_exact(LANES));
+        let mut lanes = [0.0; LANES];
+        for ((a, z), (middle, half)) in normal.zip(padded).zip(sides) {
+            for k in 0..LANES {
+                let rest = z[k] - scale * a[k];
+                lanes[k] += rest * middle[k] + rest.abs() * half[k];
+            }
+        }
+        (lanes[0] + lanes[1]) + (lanes[2] + lanes[3])
+    }
+
     /// a_i z for every row, into `products`.
     pub fn products(&self, point: &[f64], products: &mut Vec<f64>) {
         let mut padded = Vec::with_capacity(self.stride);
