@@ -401,7 +401,7 @@ fn expected(prediction: &vbar_client::v1::Prediction) -> Measurement {
 
 fn measured_at(components: Vec<f64>) -> Measurement {
     let state = Some(measurement::State::Linear(LinearState { components }));
-    Measurement { state, elapsed_s: None }
+    Measurement { state, ..Measurement::default() }
 }
 
 #[tokio::test]

@@ -74,7 +74,7 @@ async fn fly(
                 arrival.inside_guaranteed_set
             ),
             Some(Verdict::Infeasible(why)) => println!("no burn exists: {}", why.reason),
-            None => println!("the node gave no verdict"),
+            Some(Verdict::Abort(_)) | None => println!("the node gave no verdict of a plan"),
         }
     }
     Ok(())
@@ -89,6 +89,7 @@ fn measured(planned: &PlannedState, off_m: f64) -> Measurement {
     Measurement {
         state: Some(measurement::State::Relative(state)),
         elapsed_s: Some(planned.elapsed_s),
+        ..Measurement::default()
     }
 }
 

@@ -28,7 +28,7 @@ async fn main() -> Result<(), Error> {
         ),
         Some(Verdict::Arrived(arrival)) => println!("arrived: {arrival:?}"),
         Some(Verdict::Infeasible(why)) => println!("no command exists: {}", why.reason),
-        None => println!("the node gave no verdict"),
+        Some(Verdict::Abort(_)) | None => println!("the node gave no verdict of this method"),
     }
     if let Some(certificate) = answer.certificate {
         println!("certificate passed: {}, cost {}", certificate.passed, certificate.cost);

@@ -37,7 +37,7 @@ async fn main() -> Result<(), Error> {
                 println!("no command exists: {}", why.reason);
                 return Ok(());
             }
-            None => println!("the node gave no verdict"),
+            Some(Verdict::Abort(_)) | None => println!("the node gave no verdict of this method"),
         }
         let Some(expected) = answer.prediction.and_then(|p| expected(&p, step + 1)) else {
             println!("the node gave no prediction");

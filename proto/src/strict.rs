@@ -147,6 +147,7 @@ mod tests {
                     velocity_m_s: vec![0.0; 3],
                 })),
                 elapsed_s: Some(0.0),
+                working_thrusters: None,
             }),
             ..StepRequest::default()
         }

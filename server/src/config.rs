@@ -124,6 +124,7 @@ impl Config {
         count("limits.steps_max", self.limits.steps_max, 10_000_000);
         count("limits.polytope_rows_max", self.limits.polytope_rows_max, 100_000);
         count("limits.plan_instants_max", self.limits.plan_instants_max, PLAN_INSTANTS_MAX);
+        count("limits.report_states_max", self.limits.report_states_max, 1_000_000);
         let hour = Duration::from_secs(3600);
         let mut time = |setting, value: Duration, least: Duration| {
             let expected = format!("{least:?} to {hour:?}");
@@ -168,6 +169,7 @@ pub struct Settings {
     pub steps_max: Option<usize>,
     pub polytope_rows_max: Option<usize>,
     pub plan_instants_max: Option<usize>,
+    pub report_states_max: Option<usize>,
 }
 
 /// Why a source of configuration could not be read.
@@ -208,7 +210,8 @@ macro_rules! for_each_setting {
             inputs_max,
             steps_max,
             polytope_rows_max,
-            plan_instants_max
+            plan_instants_max,
+            report_states_max
         )
     };
 }
@@ -325,6 +328,9 @@ impl Settings {
                 plan_instants_max: self
                     .plan_instants_max
                     .unwrap_or(config.limits.plan_instants_max),
+                report_states_max: self
+                    .report_states_max
+                    .unwrap_or(config.limits.report_states_max),
             },
         };
         if faults.is_empty() { Ok(applied) } else { Err(SettingsError::Durations(faults)) }

@@ -50,6 +50,7 @@ pub(crate) fn measured(position_m: Vec<f64>, velocity_m_s: Vec<f64>, step: u32) 
     Measurement {
         state: Some(measurement::State::Relative(state)),
         elapsed_s: Some(f64::from(step) * sample_time_s()),
+        ..Measurement::default()
     }
 }
 

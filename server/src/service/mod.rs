@@ -140,24 +140,24 @@ impl Service {
                 return Ok(Timed { value, compute: Duration::ZERO });
             }
         };
-        let (artifact, store) = (Arc::clone(&loaded.artifact), Arc::clone(&self.store));
+        let (artifact, store) = (loaded.artifact, Arc::clone(&self.store));
         let initial = ask.initial;
         let work = move |budget: Budget<'_>| -> Result<(PlanVerdict, Option<Loaded>), Error> {
             let verdict = artifact.plan(initial.as_ref(), budget);
             let verdict = verdict.map_err(|fault| Error::step("initial", fault))?;
-            let sound = verdict.certificate().is_none_or(|certificate| certificate.passed);
+            let sound = verdict.certificate.as_ref().is_none_or(|certificate| certificate.passed);
             let kept = (sound && artifact.is_plan()).then(|| keep_plan(&*store, artifact));
             Ok((verdict, kept.transpose()?))
         };
         let timed = self.compute.run("plan", call.deadline, work).await?;
         let (verdict, kept) = timed.value?;
-        self.count(verdict.work());
-        if let Some(certificate) = verdict.certificate() {
-            self.withhold_unless_passed(Some(certificate))?;
+        self.count(verdict.work);
+        if verdict.certificate.is_some() {
+            self.withhold_unless_passed(verdict.certificate.as_ref())?;
         }
         self.planned(if verdict.is_infeasible() { "infeasible" } else { "computed" });
         let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
-        let outcome = Some(PlanResult::Decided(loaded.artifact, verdict));
+        let outcome = Some(PlanResult::Decided(Box::new(verdict)));
         let value = PlanAnswer { provenance: loaded.provenance, outcome, plan_id };
         Ok(Timed { value, compute: timed.compute })
     }
@@ -170,9 +170,9 @@ impl Service {
     ) -> Result<Timed<UploadAnswer>, Error> {
         let store = Arc::clone(&self.store);
         let UploadCall { candidate, validate_only } = ask;
-        let work = move |_: Budget<'_>| -> Result<(Arc<Artifact>, Option<Loaded>), Error> {
-            let plan = Arc::new(candidate.verify()?);
-            let kept = (!validate_only).then(|| keep_plan(&*store, Arc::clone(&plan)));
+        let work = move |_: Budget<'_>| -> Result<(Artifact, Option<Loaded>), Error> {
+            let plan = candidate.verify()?;
+            let kept = (!validate_only).then(|| keep_plan(&*store, plan.clone()));
             Ok((plan, kept.transpose()?))
         };
         let timed = self.compute.run("verify", call.deadline, work).await?;
@@ -344,8 +344,8 @@ impl Service {
             let step = artifact.artifact.step(&state, &measurement, budget);
             let step = step.map_err(|fault: StepError| Error::step("measurement", fault))?;
             let controller_state = seal_state(&artifact, &step.next());
-            let Loaded { artifact, provenance, .. } = artifact;
-            Ok(DecidedStep { artifact, provenance, step, controller_state, omit_prediction })
+            let provenance = artifact.provenance;
+            Ok(DecidedStep { provenance, step, controller_state, omit_prediction })
         };
         let timed = self.compute.run("step", call.deadline, work).await?;
         let answer = timed.value?;
@@ -517,7 +517,7 @@ fn provenance(method: Method, id: ArtifactId, content_sha256: String) -> Provena
 
 /// `id` is the name under which it was asked for: the problem's for an artifact, the content's for
 /// a plan. Controller states are bound to it.
-fn loaded(id: ArtifactId, artifact: Arc<Artifact>, bytes: &[u8]) -> Loaded {
+fn loaded(id: ArtifactId, artifact: Artifact, bytes: &[u8]) -> Loaded {
     let method = artifact.method();
     let problem = record::artifact_id(method, &artifact.canonical_problem());
     let provenance = provenance(method, problem, record::content_id(bytes).to_string());
@@ -533,7 +533,7 @@ fn kept_plan(loaded: Loaded) -> KeptPlanAnswer {
 fn stored(store: &dyn RecordStore, shelf: Shelf, id: ArtifactId) -> Result<Option<Loaded>, Error> {
     let Some(record) = store.get(shelf, &id.0)? else { return Ok(None) };
     match record::decode(shelf, id, &record) {
-        Ok((artifact, bytes)) => Ok(Some(loaded(id, Arc::new(artifact), bytes))),
+        Ok((artifact, bytes)) => Ok(Some(loaded(id, artifact, bytes))),
         Err(what) => {
             tracing::error!(%id, what, "unreadable record");
             let (reason, kind) = match shelf {
@@ -548,11 +548,11 @@ fn stored(store: &dyn RecordStore, shelf: Shelf, id: ArtifactId) -> Result<Optio
 
 /// Stores a new artifact. If another call was faster, both must have made the same bytes.
 fn keep(store: &dyn RecordStore, id: ArtifactId, artifact: Artifact) -> Result<Loaded, Error> {
-    put(store, Shelf::Artifacts, id, Arc::new(artifact))
+    put(store, Shelf::Artifacts, id, artifact)
 }
 
 /// Stores a plan under the digest of its content; the same plan twice is one plan.
-fn keep_plan(store: &dyn RecordStore, plan: Arc<Artifact>) -> Result<Loaded, Error> {
+fn keep_plan(store: &dyn RecordStore, plan: Artifact) -> Result<Loaded, Error> {
     let id = record::content_id(&plan.to_bytes());
     put(store, Shelf::Plans, id, plan)
 }
@@ -561,7 +561,7 @@ fn put(
     store: &dyn RecordStore,
     shelf: Shelf,
     id: ArtifactId,
-    artifact: Arc<Artifact>,
+    artifact: Artifact,
 ) -> Result<Loaded, Error> {
     let bytes = artifact.to_bytes();
     let record = Bytes::from(record::encode(artifact.method(), &bytes));

@@ -8,7 +8,7 @@ use vbar_proto::{google::longrunning, v1};
 
 use super::{
     Artifact, ArtifactId, Candidate, Claimed, Door, ElapsedAndState, Limits, Order, Parse, Path,
-    PlanVerdict, Problem, Provenance, Render, Step, count, types::BUILD_VERSION,
+    PlanVerdict, Planning, Problem, Provenance, Render, Step, count, types::BUILD_VERSION,
 };
 
 /// Which controller decides.
@@ -105,7 +105,6 @@ pub(crate) enum StepAnswer {
 /// A decision of a controller.
 #[derive(Debug)]
 pub(crate) struct DecidedStep {
-    pub(crate) artifact: Arc<Artifact>,
     pub(crate) provenance: Arc<Provenance>,
     pub(crate) step: Step,
     pub(crate) controller_state: Bytes,
@@ -120,7 +119,7 @@ impl Render for StepAnswer {
             Self::Decided(decided) => v1::StepResponse {
                 controller_state: decided.controller_state.clone(),
                 provenance: Some(decided.provenance.render()),
-                ..decided.artifact.render_step(&decided.step, decided.omit_prediction)
+                ..decided.step.render(decided.omit_prediction)
             },
             Self::NoController { problem, why, provenance } => v1::StepResponse {
                 verdict: Some(v1::step_response::Verdict::Infeasible(
@@ -148,11 +147,12 @@ impl Parse for PlanCall {
     fn parse(message: &v1::ComputePlanRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
         let problem = door.message(&message.problem, path.field("problem"));
         let place = path.field("initial");
-        let initial = match (&message.problem, &message.initial) {
-            (Some(problem), Some(_)) if !Problem::wants_initial(problem) => {
+        let planning = message.problem.as_ref().and_then(Problem::planning);
+        let initial = match (planning, &message.initial) {
+            (Some(Planning::IsArtifact), Some(_)) => {
                 door.refuse(place, "nothing: the problem has its initial state", "a measurement")
             }
-            (Some(problem), None) if !Problem::wants_initial(problem) => Some(None),
+            (Some(Planning::IsArtifact), None) => Some(None),
             (_, initial) => door.message(initial, place).map(Some),
         };
         Some(Self { problem: problem?, initial: initial?, validate_only: message.validate_only })
@@ -173,7 +173,7 @@ pub(crate) struct PlanAnswer {
 #[derive(Debug)]
 pub(crate) enum PlanResult {
     /// The controller exists; the verdict says whether a plan does.
-    Decided(Arc<Artifact>, PlanVerdict),
+    Decided(Box<PlanVerdict>),
     /// Already the controller does not exist.
     NoController(Problem, Arc<Infeasibility>),
 }
@@ -183,10 +183,10 @@ impl Render for PlanAnswer {
 
     fn render(&self) -> v1::ComputePlanResponse {
         use v1::compute_plan_response::Outcome;
-        let outcome = self.outcome.as_ref().and_then(|outcome| match outcome {
-            PlanResult::Decided(artifact, verdict) => artifact.render_plan(verdict),
+        let outcome = self.outcome.as_ref().map(|outcome| match outcome {
+            PlanResult::Decided(verdict) => verdict.outcome.clone(),
             PlanResult::NoController(problem, why) => {
-                Some(Outcome::Infeasible(problem.render_infeasible(why)))
+                Outcome::Infeasible(problem.render_infeasible(why))
             }
         });
         v1::ComputePlanResponse {
@@ -224,7 +224,7 @@ impl Parse for UploadCall {
 /// Answer of `UploadPlan`.
 #[derive(Debug)]
 pub(crate) struct UploadAnswer {
-    pub(crate) plan: Arc<Artifact>,
+    pub(crate) plan: Artifact,
     /// `None` if only validated.
     pub(crate) plan_id: Option<ArtifactId>,
 }
@@ -258,7 +258,7 @@ impl Parse for KeptPlanCall {
 #[derive(Debug)]
 pub(crate) struct KeptPlanAnswer {
     pub(crate) id: ArtifactId,
-    pub(crate) plan: Arc<Artifact>,
+    pub(crate) plan: Artifact,
     pub(crate) provenance: Arc<Provenance>,
     pub(crate) size_bytes: usize,
 }
@@ -414,7 +414,7 @@ impl Parse for ArtifactCall {
 #[derive(Debug, Clone)]
 pub(crate) struct ArtifactAnswer {
     pub(crate) id: ArtifactId,
-    pub(crate) artifact: Arc<Artifact>,
+    pub(crate) artifact: Artifact,
     pub(crate) provenance: Arc<Provenance>,
     pub(crate) size_bytes: usize,
 }
@@ -631,6 +631,7 @@ impl Render for InfoAnswer {
                 steps_max: count(self.limits.steps_max),
                 polytope_rows_max: count(self.limits.polytope_rows_max),
                 plan_instants_max: count(self.limits.plan_instants_max),
+                report_states_max: count(self.limits.report_states_max),
                 concurrent_computations_max: count(self.compute_threads),
                 computation_time_max_s: self.computation_time_max.as_secs_f64(),
             }),

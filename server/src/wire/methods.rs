@@ -1,58 +1,129 @@
-//! The methods as the service sees them: values whose method only this file looks at.
+//! The methods as the service sees them: values whose method it never learns.
 //!
-//! A new method adds an arm to each enum here, beside its own file; transport, service and store
-//! never learn its name.
+//! A method says in [`Wired`], beside its own messages, how it is read, flown and written; what is
+//! here forgets which method it was. A new one adds a line to [`Problem`]'s parser and to
+//! [`wired`].
+
+use std::{any::Any, fmt, marker::PhantomData, sync::Arc};
 
 use vbar_guidance::{
     Budget, Method,
     control::{
-        Certificate, Controller, Fault, Infeasibility, PrepareError, StepError,
+        Certificate, Controller, Failure, Fault, Infeasibility, PrepareError, StepError,
         disturbance_feedback::{self, DisturbanceFeedback},
-        variable_horizon::{self, VariableHorizon},
+        variable_horizon::VariableHorizon,
     },
 };
-use vbar_proto::v1::{self, problem::Method as Message};
+use vbar_proto::v1::{self, compute_plan_response::Outcome, problem::Method as Message};
 
 use super::{
     Claimed, Document, Door, ElapsedAndState, Missing, Order, Parse, Path, Violations,
-    disturbance_feedback as df, export, types, variable_horizon as wire,
+    disturbance_feedback as df, export, types,
 };
 
-/// A mission.
-#[derive(Debug, Clone)]
-pub(crate) enum Problem {
-    VariableHorizon(Box<variable_horizon::Problem>),
-    DisturbanceFeedback(Box<disturbance_feedback::Problem>),
+/// One method on the wire: its own messages, and what the service asks of it.
+pub(super) trait Wired:
+    Controller<
+        Problem: Parse + Clone + fmt::Debug + Send + Sync + 'static,
+        Shard: Send + 'static,
+        Artifact: fmt::Debug + Send + Sync + 'static,
+        State: Clone + fmt::Debug + Send + Sync + 'static,
+        Answer: fmt::Debug + Send + Sync + 'static,
+    > + Send
+    + Sync
+    + 'static
+{
+    /// Whose messages these are.
+    const METHOD: Method;
+    /// What `ComputePlan` means for it.
+    const PLANNING: Planning;
+
+    /// Our own encoding of the parsed values; its digest names the problem.
+    fn canonical_bytes(problem: &Self::Problem) -> Vec<u8>;
+    /// Units of the amounts by which constraints are missed.
+    fn units(problem: &Self::Problem) -> types::Units;
+
+    /// The problem an artifact was made for.
+    fn problem(artifact: &Self::Artifact) -> &Self::Problem;
+    /// Its own bytes.
+    fn artifact_to_bytes(artifact: &Self::Artifact) -> Vec<u8>;
+    /// Reads and checks again what [`Wired::artifact_to_bytes`] wrote.
+    fn artifact_from_bytes(bytes: &[u8]) -> Result<Self::Artifact, String>;
+    /// Writes the method's own summary.
+    fn render_summary(artifact: &Self::Artifact) -> v1::artifact::Summary;
+    /// The artifact as a plan that can be kept and flown, if that is what it is.
+    fn as_plan(_artifact: &Self::Artifact) -> Option<&disturbance_feedback::Plan> {
+        None
+    }
+
+    /// The step a state is for.
+    fn step_index(state: &Self::State) -> usize;
+    /// Its own bytes.
+    fn state_to_bytes(state: &Self::State) -> Vec<u8>;
+    /// Reads what [`Wired::state_to_bytes`] wrote.
+    fn state_from_bytes(bytes: &[u8]) -> Result<Self::State, String>;
+
+    /// The measurement as this method takes it; the fault's field is relative to it.
+    fn measurement(measured: &ElapsedAndState) -> Result<Self::Measurement, Fault>;
+
+    /// The state for the next step.
+    fn next(step: &Self::Answer) -> &Self::State;
+    /// What was decided.
+    fn kind(step: &Self::Answer) -> VerdictKind;
+    /// The proof, if there is a command.
+    fn certificate(step: &Self::Answer) -> Option<&Certificate>;
+    /// What the solvers did.
+    fn work(step: &Self::Answer) -> SolverWork;
+    /// Everything of a step's answer but what its envelope knows: controller state, provenance.
+    fn render_step(
+        artifact: &Self::Artifact,
+        step: &Self::Answer,
+        omit_prediction: bool,
+    ) -> v1::StepResponse;
+
+    /// Computes a plan to fly without re-optimising; `initial` is there if
+    /// [`Planning::FromMeasurement`].
+    fn plan(
+        artifact: &Self::Artifact,
+        initial: Option<&ElapsedAndState>,
+        budget: Budget<'_>,
+    ) -> Result<PlanVerdict, StepError>;
 }
 
-/// What a precompute made.
-#[derive(Debug)]
-pub(crate) enum Artifact {
-    VariableHorizon(Box<variable_horizon::Artifact>),
-    /// A plan is its own controller.
-    DisturbanceFeedback(Box<disturbance_feedback::Plan>),
-}
-
-/// What one step hands to the next.
-#[derive(Debug, Clone)]
-pub(crate) enum State {
-    VariableHorizon(variable_horizon::State),
-    DisturbanceFeedback(disturbance_feedback::State),
-}
-
-/// A decided step.
-#[derive(Debug)]
-pub(crate) enum Step {
-    VariableHorizon(Box<variable_horizon::Step>),
-    DisturbanceFeedback(Box<disturbance_feedback::Step>),
+/// What `ComputePlan` means for a method.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Planning {
+    /// It plans from a state that comes with the request.
+    FromMeasurement,
+    /// Its artifact is the plan; the problem has its initial state.
+    IsArtifact,
 }
 
 /// A plan, or why there is none.
 #[derive(Debug)]
-pub(crate) enum PlanVerdict {
-    VariableHorizon(Box<variable_horizon::PlanOutcome>),
-    /// The artifact is the plan.
-    DisturbanceFeedback,
+pub(crate) struct PlanVerdict {
+    /// As it is answered.
+    pub(super) outcome: Outcome,
+    /// The proof; `None` if it was checked when the artifact was made, or without a plan.
+    pub(crate) certificate: Option<Certificate>,
+    /// What the solvers did.
+    pub(crate) work: SolverWork,
+}
+
+impl PlanVerdict {
+    /// There is none.
+    pub(super) fn infeasible(why: &Infeasibility, units: types::Units) -> Self {
+        Self {
+            outcome: Outcome::Infeasible(types::render_infeasible(why, units)),
+            certificate: None,
+            work: SolverWork::default(),
+        }
+    }
+
+    /// Whether there is no plan.
+    pub(crate) fn is_infeasible(&self) -> bool {
+        matches!(self.outcome, Outcome::Infeasible(_))
+    }
 }
 
 /// What the solvers did for one answer.
@@ -72,6 +143,10 @@ pub(crate) enum VerdictKind {
     Infeasible,
 }
 
+/// A mission.
+#[derive(Debug, Clone)]
+pub(crate) struct Problem(Arc<dyn AnyProblem>);
+
 impl Parse for Problem {
     type Message = v1::Problem;
 
@@ -79,120 +154,117 @@ impl Parse for Problem {
         match &message.method {
             None => door.refuse(path, "one of variable_horizon, disturbance_feedback", "nothing"),
             Some(Message::VariableHorizon(problem)) => {
-                Parse::parse(problem, path.field("variable_horizon"), door)
-                    .map(|problem| Self::VariableHorizon(Box::new(problem)))
+                asked::<VariableHorizon>(problem, path.field("variable_horizon"), door)
             }
             Some(Message::DisturbanceFeedback(problem)) => {
-                Parse::parse(problem, path.field("disturbance_feedback"), door)
-                    .map(|problem| Self::DisturbanceFeedback(Box::new(problem)))
+                asked::<DisturbanceFeedback>(problem, path.field("disturbance_feedback"), door)
+            }
+            Some(Message::AbortSafe(_)) => {
+                let served = "one of variable_horizon, disturbance_feedback";
+                door.refuse(path, served, "abort_safe, which this server does not serve yet")
             }
         }
     }
 }
 
+/// What each method's artifacts and states are read with.
+fn wired(method: Method) -> &'static dyn AnyMethod {
+    match method {
+        Method::VariableHorizon => &Of::<VariableHorizon>(PhantomData),
+        Method::DisturbanceFeedback => &Of::<DisturbanceFeedback>(PhantomData),
+    }
+}
+
+fn asked<M: Wired>(
+    message: &<M::Problem as Parse>::Message,
+    path: Path<'_>,
+    door: &mut Door,
+) -> Option<Problem> {
+    M::Problem::parse(message, path, door).map(|problem| Problem(Arc::new(Asked::<M>(problem))))
+}
+
 impl Problem {
-    /// Whether a request for a plan has to bring the state at the mission's start.
-    pub(super) fn wants_initial(message: &v1::Problem) -> bool {
-        !matches!(message.method, Some(Message::DisturbanceFeedback(_)))
+    /// What `ComputePlan` means for the method of a message, if it names one.
+    pub(super) fn planning(message: &v1::Problem) -> Option<Planning> {
+        Some(match message.method.as_ref()? {
+            Message::VariableHorizon(_) => VariableHorizon::PLANNING,
+            Message::DisturbanceFeedback(_) => DisturbanceFeedback::PLANNING,
+            Message::AbortSafe(_) => return None,
+        })
     }
 
     /// Whose problem it is.
     pub(crate) fn method(&self) -> Method {
-        match self {
-            Self::VariableHorizon(_) => Method::VariableHorizon,
-            Self::DisturbanceFeedback(_) => Method::DisturbanceFeedback,
-        }
+        self.0.method()
     }
 
     /// Our own encoding of the parsed values; its digest names the problem.
     pub(crate) fn canonical_bytes(&self) -> Vec<u8> {
-        match self {
-            Self::VariableHorizon(problem) => problem.canonical_bytes(),
-            Self::DisturbanceFeedback(problem) => problem.canonical_bytes(),
-        }
+        self.0.canonical_bytes()
     }
 
-    /// Thinks long once.
+    /// Number of shards of its precompute, at least 1.
+    pub(crate) fn shards(&self) -> usize {
+        self.0.shards()
+    }
+
+    /// Computes one shard.
+    pub(crate) fn run_shard(
+        &self,
+        shard: usize,
+        budget: Budget<'_>,
+    ) -> Result<Shard, PrepareError> {
+        self.0.run_shard(shard, budget)
+    }
+
+    /// Puts shards, in their order, together.
+    pub(crate) fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+        self.0.merge(shards)
+    }
+
+    /// Thinks long once: every shard in order, on the caller's thread.
     pub(crate) fn prepare(&self, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
-        match self {
-            Self::VariableHorizon(problem) => prepare::<VariableHorizon>(problem, budget)
-                .map(|artifact| Artifact::VariableHorizon(Box::new(artifact))),
-            Self::DisturbanceFeedback(problem) => prepare::<DisturbanceFeedback>(problem, budget)
-                .map(|plan| Artifact::DisturbanceFeedback(Box::new(plan))),
-        }
+        let shards = (0..self.shards()).map(|shard| self.run_shard(shard, budget));
+        self.merge(shards.collect::<Result<_, _>>()?)
     }
 
     /// Writes why no artifact can be made.
     pub(super) fn render_infeasible(&self, why: &Infeasibility) -> v1::Infeasible {
-        match self {
-            Self::VariableHorizon(problem) => {
-                types::render_infeasible(why, types::Units::scaled(wire::position_unit_m(problem)))
-            }
-            Self::DisturbanceFeedback(problem) => {
-                types::render_infeasible(why, types::Units::impulses(problem.delta_v_max_m_s))
-            }
-        }
+        types::render_infeasible(why, self.0.units())
     }
 }
 
-/// Shards in order, on the caller's thread.
-fn prepare<C: Controller>(
-    problem: &C::Problem,
-    budget: Budget<'_>,
-) -> Result<C::Artifact, PrepareError> {
-    let shards = (0..C::shards(problem))
-        .map(|shard| C::run_shard(problem, shard, budget))
-        .collect::<Result<_, _>>()?;
-    C::merge(problem, shards)
-}
+/// Part of an artifact that was computed on its own.
+pub(crate) struct Shard(Box<dyn Any + Send>);
+
+/// What a precompute made.
+#[derive(Debug, Clone)]
+pub(crate) struct Artifact(Arc<dyn AnyArtifact>);
 
 impl Artifact {
-    /// The canonical bytes of the problem it was made for.
-    pub(crate) fn canonical_problem(&self) -> Vec<u8> {
-        match self {
-            Self::VariableHorizon(artifact) => artifact.problem().canonical_bytes(),
-            Self::DisturbanceFeedback(plan) => plan.problem().canonical_bytes(),
-        }
-    }
-
     /// Whose artifact it is.
     pub(crate) fn method(&self) -> Method {
-        match self {
-            Self::VariableHorizon(_) => Method::VariableHorizon,
-            Self::DisturbanceFeedback(_) => Method::DisturbanceFeedback,
-        }
+        self.0.method()
+    }
+
+    /// The canonical bytes of the problem it was made for.
+    pub(crate) fn canonical_problem(&self) -> Vec<u8> {
+        self.0.canonical_problem()
     }
 
     /// Its own bytes.
     pub(crate) fn to_bytes(&self) -> Vec<u8> {
-        match self {
-            Self::VariableHorizon(artifact) => artifact.to_bytes(),
-            Self::DisturbanceFeedback(plan) => plan.to_bytes(),
-        }
+        self.0.to_bytes()
     }
 
     /// Reads and checks again what [`Artifact::to_bytes`] wrote.
     pub(crate) fn from_bytes(method: Method, bytes: &[u8]) -> Result<Self, String> {
-        match method {
-            Method::VariableHorizon => variable_horizon::Artifact::from_bytes(bytes)
-                .map(|artifact| Self::VariableHorizon(Box::new(artifact)))
-                .map_err(|fault| fault.to_string()),
-            Method::DisturbanceFeedback => disturbance_feedback::Plan::from_bytes(bytes)
-                .map(|plan| Self::DisturbanceFeedback(Box::new(plan)))
-                .map_err(|fault| fault.to_string()),
-        }
+        wired(method).artifact_from_bytes(bytes)
     }
 
     /// The state before the first step.
     pub(crate) fn start(&self) -> State {
-        match self {
-            Self::VariableHorizon(artifact) => {
-                State::VariableHorizon(VariableHorizon::start(artifact))
-            }
-            Self::DisturbanceFeedback(plan) => {
-                State::DisturbanceFeedback(DisturbanceFeedback::start(plan))
-            }
-        }
+        self.0.start()
     }
 
     /// Decides the next command.
@@ -202,24 +274,7 @@ impl Artifact {
         measured: &ElapsedAndState,
         budget: Budget<'_>,
     ) -> Result<Step, StepError> {
-        match (self, state) {
-            (Self::VariableHorizon(artifact), State::VariableHorizon(state)) => {
-                VariableHorizon::step(artifact, state, &wire::measurement(measured), budget)
-                    .map(|step| Step::VariableHorizon(Box::new(step)))
-            }
-            (Self::DisturbanceFeedback(plan), State::DisturbanceFeedback(state)) => {
-                let Some(measurement) = df::measurement(measured) else {
-                    let fault = Fault::new("", "relative: the state of a spacecraft", "linear");
-                    return Err(StepError::Measurement(vec![fault]));
-                };
-                DisturbanceFeedback::step(plan, state, &measurement, budget)
-                    .map(|step| Step::DisturbanceFeedback(Box::new(step)))
-            }
-            (Self::VariableHorizon(_), State::DisturbanceFeedback(_))
-            | (Self::DisturbanceFeedback(_), State::VariableHorizon(_)) => {
-                Err(StepError::State("it belongs to another method".to_owned()))
-            }
-        }
+        Arc::clone(&self.0).step(&*state.0, measured, budget).map(Step)
     }
 
     /// Computes a plan to fly without re-optimising; `initial` is there if the method wants it.
@@ -228,226 +283,312 @@ impl Artifact {
         initial: Option<&ElapsedAndState>,
         budget: Budget<'_>,
     ) -> Result<PlanVerdict, StepError> {
-        match (self, initial) {
-            (Self::VariableHorizon(artifact), Some(initial)) => {
-                variable_horizon::plan(artifact, &wire::measurement(initial), budget)
-                    .map(|outcome| PlanVerdict::VariableHorizon(Box::new(outcome)))
-            }
-            (Self::VariableHorizon(_), None) => {
-                let fault = Fault::new("", "a value (the field is required)", "nothing");
-                Err(StepError::Measurement(vec![fault]))
-            }
-            (Self::DisturbanceFeedback(_), _) => Ok(PlanVerdict::DisturbanceFeedback),
-        }
+        self.0.plan(initial, budget)
     }
 
     /// Whether it is itself a plan, which can be kept and flown.
     pub(crate) fn is_plan(&self) -> bool {
-        matches!(self, Self::DisturbanceFeedback(_))
+        self.0.as_plan().is_some()
     }
 
     /// Writes a plan as a document; `None` for what is no plan.
     pub(crate) fn export(&self, plan_id: &str, order: &Order) -> Option<Result<Document, Missing>> {
-        match self {
-            Self::VariableHorizon(_) => None,
-            Self::DisturbanceFeedback(plan) => Some(export::export(plan, plan_id, order)),
-        }
+        self.0.as_plan().map(|plan| export::export(plan, plan_id, order))
     }
 
     /// Writes a plan with its mission; `None` for what is no plan.
     pub(crate) fn render_document(&self) -> Option<v1::PlanDocument> {
-        match self {
-            Self::VariableHorizon(_) => None,
-            Self::DisturbanceFeedback(plan) => {
-                let method = Message::DisturbanceFeedback(df::render_problem(plan.problem()));
-                Some(v1::PlanDocument {
-                    problem: Some(v1::Problem { method: Some(method) }),
-                    plan: Some(df::wrapped(plan)),
-                })
-            }
-        }
+        self.0.as_plan().map(df::render_document)
     }
 
     /// Writes a plan in one line; `None` for what is no plan.
     pub(super) fn render_line(&self) -> Option<v1::PlanSummary> {
-        match self {
-            Self::VariableHorizon(_) => None,
-            Self::DisturbanceFeedback(plan) => Some(df::render_line(plan)),
-        }
+        self.0.as_plan().map(df::render_line)
     }
 
     /// Writes the proof of a plan; `None` for what is no plan.
     pub(crate) fn render_plan_certificate(&self) -> Option<v1::PlanCertificate> {
-        match self {
-            Self::VariableHorizon(_) => None,
-            Self::DisturbanceFeedback(plan) => {
-                Some(df::render_plan_certificate(&plan.outcome().certificate))
-            }
-        }
+        self.0.as_plan().map(|plan| df::render_plan_certificate(&plan.outcome().certificate))
     }
 
     /// Writes the method's own summary.
     pub(super) fn render_summary(&self) -> v1::artifact::Summary {
-        match self {
-            Self::VariableHorizon(artifact) => {
-                v1::artifact::Summary::VariableHorizon(wire::render_artifact(artifact))
-            }
-            Self::DisturbanceFeedback(plan) => {
-                let plan = Some(df::render_plan(plan));
-                let summary = v1::DisturbanceFeedbackArtifact { plan };
-                v1::artifact::Summary::DisturbanceFeedback(summary)
-            }
-        }
-    }
-
-    /// Writes a step's answer but for what its envelope knows.
-    pub(super) fn render_step(&self, step: &Step, omit_prediction: bool) -> v1::StepResponse {
-        match (self, step) {
-            (Self::VariableHorizon(artifact), Step::VariableHorizon(step)) => {
-                wire::render_step(artifact, step, omit_prediction)
-            }
-            (Self::DisturbanceFeedback(plan), Step::DisturbanceFeedback(step)) => {
-                df::render_step(plan, step, omit_prediction)
-            }
-            // A step is rendered by the artifact that decided it.
-            (Self::VariableHorizon(_), Step::DisturbanceFeedback(_))
-            | (Self::DisturbanceFeedback(_), Step::VariableHorizon(_)) => {
-                v1::StepResponse::default()
-            }
-        }
-    }
-
-    /// Writes a plan's outcome.
-    pub(super) fn render_plan(
-        &self,
-        verdict: &PlanVerdict,
-    ) -> Option<v1::compute_plan_response::Outcome> {
-        use v1::compute_plan_response::Outcome;
-        match (self, verdict) {
-            (Self::VariableHorizon(artifact), PlanVerdict::VariableHorizon(outcome)) => {
-                Some(match &**outcome {
-                    variable_horizon::PlanOutcome::Plan(plan) => {
-                        Outcome::Plan(wire::render_plan(artifact, plan))
-                    }
-                    variable_horizon::PlanOutcome::Infeasible(why) => {
-                        let unit = wire::position_unit_m(artifact.problem());
-                        Outcome::Infeasible(types::render_infeasible(
-                            why,
-                            types::Units::scaled(unit),
-                        ))
-                    }
-                })
-            }
-            (Self::DisturbanceFeedback(plan), PlanVerdict::DisturbanceFeedback) => {
-                Some(Outcome::Plan(df::wrapped(plan)))
-            }
-            // A verdict is rendered by the artifact that gave it.
-            (Self::VariableHorizon(_), PlanVerdict::DisturbanceFeedback)
-            | (Self::DisturbanceFeedback(_), PlanVerdict::VariableHorizon(_)) => None,
-        }
+        self.0.render_summary()
     }
 }
+
+/// What one step hands to the next.
+#[derive(Debug, Clone)]
+pub(crate) struct State(Arc<dyn AnyState>);
 
 impl State {
     /// The step it is for.
     pub(crate) fn step_index(&self) -> usize {
-        match self {
-            Self::VariableHorizon(state) => state.step_index(),
-            Self::DisturbanceFeedback(state) => state.step_index(),
-        }
+        self.0.step_index()
     }
 
     /// Its own bytes.
     pub(crate) fn to_bytes(&self) -> Vec<u8> {
-        match self {
-            Self::VariableHorizon(state) => state.to_bytes(),
-            Self::DisturbanceFeedback(state) => state.to_bytes(),
-        }
+        self.0.to_bytes()
     }
 
     /// Reads what [`State::to_bytes`] wrote for a method.
     pub(crate) fn from_bytes(method: Method, bytes: &[u8]) -> Result<Self, String> {
-        match method {
-            Method::VariableHorizon => variable_horizon::State::from_bytes(bytes)
-                .map(Self::VariableHorizon)
-                .map_err(|fault| fault.to_string()),
-            Method::DisturbanceFeedback => disturbance_feedback::State::from_bytes(bytes)
-                .map(Self::DisturbanceFeedback)
-                .map_err(|fault| fault.to_string()),
-        }
+        wired(method).state_from_bytes(bytes)
     }
 }
+
+/// A decided step.
+#[derive(Debug)]
+pub(crate) struct Step(Box<dyn AnyStep>);
 
 impl Step {
     /// The state for the next step.
     pub(crate) fn next(&self) -> State {
-        match self {
-            Self::VariableHorizon(step) => State::VariableHorizon(step.next.clone()),
-            Self::DisturbanceFeedback(step) => State::DisturbanceFeedback(step.next.clone()),
-        }
+        self.0.next()
     }
 
     /// What was decided.
     pub(crate) fn kind(&self) -> VerdictKind {
-        match self {
-            Self::VariableHorizon(step) => match step.verdict {
-                variable_horizon::Verdict::Command(_) => VerdictKind::Command,
-                variable_horizon::Verdict::Arrived(_) => VerdictKind::Arrived,
-                variable_horizon::Verdict::Infeasible(_) => VerdictKind::Infeasible,
-            },
-            Self::DisturbanceFeedback(step) => match step.verdict {
-                disturbance_feedback::Verdict::Burn(_) => VerdictKind::Command,
-                disturbance_feedback::Verdict::Arrived(_) => VerdictKind::Arrived,
-            },
-        }
+        self.0.kind()
     }
 
     /// The proof, if there is a command.
     pub(crate) fn certificate(&self) -> Option<&Certificate> {
-        match self {
-            Self::VariableHorizon(step) => step.certificate.as_ref(),
-            Self::DisturbanceFeedback(step) => step.certificate.as_ref(),
-        }
+        self.0.certificate()
     }
 
     /// What the solvers did.
     pub(crate) fn work(&self) -> SolverWork {
-        match self {
-            Self::VariableHorizon(step) => work(&step.diagnostics),
-            // Flying a plan solves nothing.
-            Self::DisturbanceFeedback(_) => SolverWork::default(),
-        }
+        self.0.work()
+    }
+
+    /// Writes the answer but for what its envelope knows.
+    pub(super) fn render(&self, omit_prediction: bool) -> v1::StepResponse {
+        self.0.render(omit_prediction)
     }
 }
 
-impl PlanVerdict {
-    /// The proof, if there is a plan.
-    pub(crate) fn certificate(&self) -> Option<&Certificate> {
-        self.plan().map(|plan| &plan.certificate)
+/// A method, without its values.
+trait AnyMethod: Sync {
+    fn artifact_from_bytes(&self, bytes: &[u8]) -> Result<Artifact, String>;
+    fn state_from_bytes(&self, bytes: &[u8]) -> Result<State, String>;
+}
+
+struct Of<M>(PhantomData<M>);
+
+impl<M: Wired> AnyMethod for Of<M> {
+    fn artifact_from_bytes(&self, bytes: &[u8]) -> Result<Artifact, String> {
+        M::artifact_from_bytes(bytes).map(Made::<M>::artifact)
     }
 
-    /// Whether there is no plan.
-    pub(crate) fn is_infeasible(&self) -> bool {
-        match self {
-            Self::VariableHorizon(_) => self.plan().is_none(),
-            Self::DisturbanceFeedback => false,
-        }
+    fn state_from_bytes(&self, bytes: &[u8]) -> Result<State, String> {
+        M::state_from_bytes(bytes).map(Between::<M>::state)
+    }
+}
+
+trait AnyProblem: fmt::Debug + Send + Sync {
+    fn method(&self) -> Method;
+    fn canonical_bytes(&self) -> Vec<u8>;
+    fn units(&self) -> types::Units;
+    fn shards(&self) -> usize;
+    fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Shard, PrepareError>;
+    fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError>;
+}
+
+/// A problem of method `M`.
+struct Asked<M: Wired>(M::Problem);
+
+impl<M: Wired> fmt::Debug for Asked<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl<M: Wired> AnyProblem for Asked<M> {
+    fn method(&self) -> Method {
+        M::METHOD
     }
 
-    /// What the solvers did; unknown without a plan.
-    pub(crate) fn work(&self) -> SolverWork {
-        self.plan().map(|plan| work(&plan.diagnostics)).unwrap_or_default()
+    fn canonical_bytes(&self) -> Vec<u8> {
+        M::canonical_bytes(&self.0)
     }
 
-    fn plan(&self) -> Option<&variable_horizon::Plan> {
-        match self {
-            Self::VariableHorizon(outcome) => match &**outcome {
-                variable_horizon::PlanOutcome::Plan(plan) => Some(plan),
-                variable_horizon::PlanOutcome::Infeasible(_) => None,
-            },
-            // Its certificate was checked when it was made.
-            Self::DisturbanceFeedback => None,
-        }
+    fn units(&self) -> types::Units {
+        M::units(&self.0)
+    }
+
+    fn shards(&self) -> usize {
+        M::shards(&self.0)
+    }
+
+    fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Shard, PrepareError> {
+        M::run_shard(&self.0, shard, budget).map(|shard| Shard(Box::new(shard)))
+    }
+
+    fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+        let own = shards.into_iter().map(|Shard(shard)| match shard.downcast::<M::Shard>() {
+            Ok(shard) => Ok(*shard),
+            Err(_) => Err(Failure::Numerical("a shard of another method".to_owned())),
+        });
+        M::merge(&self.0, own.collect::<Result<_, _>>()?).map(Made::<M>::artifact)
+    }
+}
+
+trait AnyArtifact: fmt::Debug + Send + Sync {
+    fn method(&self) -> Method;
+    fn canonical_problem(&self) -> Vec<u8>;
+    fn to_bytes(&self) -> Vec<u8>;
+    fn start(&self) -> State;
+    fn step(
+        self: Arc<Self>,
+        state: &dyn AnyState,
+        measured: &ElapsedAndState,
+        budget: Budget<'_>,
+    ) -> Result<Box<dyn AnyStep>, StepError>;
+    fn plan(
+        &self,
+        initial: Option<&ElapsedAndState>,
+        budget: Budget<'_>,
+    ) -> Result<PlanVerdict, StepError>;
+    fn as_plan(&self) -> Option<&disturbance_feedback::Plan>;
+    fn render_summary(&self) -> v1::artifact::Summary;
+}
+
+/// An artifact of method `M`.
+struct Made<M: Wired>(M::Artifact);
+
+impl<M: Wired> Made<M> {
+    fn artifact(made: M::Artifact) -> Artifact {
+        Artifact(Arc::new(Self(made)))
+    }
+}
+
+impl<M: Wired> fmt::Debug for Made<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl<M: Wired> AnyArtifact for Made<M> {
+    fn method(&self) -> Method {
+        M::METHOD
+    }
+
+    fn canonical_problem(&self) -> Vec<u8> {
+        M::canonical_bytes(M::problem(&self.0))
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        M::artifact_to_bytes(&self.0)
+    }
+
+    fn start(&self) -> State {
+        Between::<M>::state(M::start(&self.0))
+    }
+
+    fn step(
+        self: Arc<Self>,
+        state: &dyn AnyState,
+        measured: &ElapsedAndState,
+        budget: Budget<'_>,
+    ) -> Result<Box<dyn AnyStep>, StepError> {
+        let state: &dyn Any = state;
+        let Some(Between(state)) = state.downcast_ref::<Between<M>>() else {
+            return Err(StepError::State("it belongs to another method".to_owned()));
+        };
+        let measurement =
+            M::measurement(measured).map_err(|fault| StepError::Measurement(vec![fault]))?;
+        let answer = M::step(&self.0, state, &measurement, budget)?;
+        Ok(Box::new(Decided { by: self, answer }))
+    }
+
+    fn plan(
+        &self,
+        initial: Option<&ElapsedAndState>,
+        budget: Budget<'_>,
+    ) -> Result<PlanVerdict, StepError> {
+        M::plan(&self.0, initial, budget)
+    }
+
+    fn as_plan(&self) -> Option<&disturbance_feedback::Plan> {
+        M::as_plan(&self.0)
+    }
+
+    fn render_summary(&self) -> v1::artifact::Summary {
+        M::render_summary(&self.0)
+    }
+}
+
+trait AnyState: Any + fmt::Debug + Send + Sync {
+    fn step_index(&self) -> usize;
+    fn to_bytes(&self) -> Vec<u8>;
+}
+
+/// A state of method `M`, between two steps.
+struct Between<M: Wired>(M::State);
+
+impl<M: Wired> Between<M> {
+    fn state(state: M::State) -> State {
+        State(Arc::new(Self(state)))
+    }
+}
+
+impl<M: Wired> fmt::Debug for Between<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl<M: Wired> AnyState for Between<M> {
+    fn step_index(&self) -> usize {
+        M::step_index(&self.0)
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        M::state_to_bytes(&self.0)
+    }
+}
+
+trait AnyStep: fmt::Debug + Send + Sync {
+    fn next(&self) -> State;
+    fn kind(&self) -> VerdictKind;
+    fn certificate(&self) -> Option<&Certificate>;
+    fn work(&self) -> SolverWork;
+    fn render(&self, omit_prediction: bool) -> v1::StepResponse;
+}
+
+/// A step that an artifact of method `M` decided.
+struct Decided<M: Wired> {
+    by: Arc<Made<M>>,
+    answer: M::Answer,
+}
+
+impl<M: Wired> fmt::Debug for Decided<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.answer.fmt(f)
+    }
+}
+
+impl<M: Wired> AnyStep for Decided<M> {
+    fn next(&self) -> State {
+        Between::<M>::state(M::next(&self.answer).clone())
+    }
+
+    fn kind(&self) -> VerdictKind {
+        M::kind(&self.answer)
+    }
+
+    fn certificate(&self) -> Option<&Certificate> {
+        M::certificate(&self.answer)
+    }
+
+    fn work(&self) -> SolverWork {
+        M::work(&self.answer)
+    }
+
+    fn render(&self, omit_prediction: bool) -> v1::StepResponse {
+        M::render_step(&self.by.0, &self.answer, omit_prediction)
     }
 }
 
@@ -476,13 +617,6 @@ impl Candidate {
                 })?
             }
         };
-        Ok(Artifact::DisturbanceFeedback(Box::new(plan)))
-    }
-}
-
-fn work(diagnostics: &variable_horizon::Diagnostics) -> SolverWork {
-    SolverWork {
-        simplex_pivots: diagnostics.simplex_pivots,
-        general_solver_calls: diagnostics.general_solver_calls,
+        Ok(Made::<DisturbanceFeedback>::artifact(plan))
     }
 }

@@ -24,8 +24,9 @@ pub(crate) use calls::{
 pub(crate) use controller_state::{ControllerState, StateFault};
 pub(crate) use disturbance_feedback::Claimed;
 pub(crate) use export::{Document, Missing, OcmBurn, OcmFault, Order, read_ocm_burns};
+use methods::Wired;
 pub(crate) use methods::{
-    Artifact, Candidate, PlanVerdict, Problem, SolverWork, State, Step, VerdictKind,
+    Artifact, Candidate, PlanVerdict, Planning, Problem, SolverWork, State, Step, VerdictKind,
 };
 pub(crate) use types::{ArtifactId, ElapsedAndState, Provenance};
 pub(crate) use vbar_guidance::control::disturbance_feedback::INSTANTS_MAX as PLAN_INSTANTS_MAX;
@@ -47,6 +48,8 @@ pub struct Limits {
     pub polytope_rows_max: usize,
     /// Most instants of a plan with disturbance feedback.
     pub plan_instants_max: usize,
+    /// Most states of a safety report.
+    pub report_states_max: usize,
 }
 
 impl Default for Limits {
@@ -61,6 +64,7 @@ impl Default for Limits {
             steps_max: 10_000,
             polytope_rows_max: 64,
             plan_instants_max: PLAN_INSTANTS_MAX,
+            report_states_max: 2000,
         }
     }
 }

@@ -49,7 +49,7 @@ impl Loop {
 fn measured(components: [f64; 2]) -> v1::StepStreamRequest {
     let state = v1::LinearState { components: components.to_vec() };
     let state = Some(v1::measurement::State::Linear(state));
-    let measurement = Some(v1::Measurement { state, elapsed_s: None });
+    let measurement = Some(v1::Measurement { state, ..v1::Measurement::default() });
     v1::StepStreamRequest { measurement, ..v1::StepStreamRequest::default() }
 }
 

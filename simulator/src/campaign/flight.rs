@@ -506,12 +506,13 @@ impl Session {
                     velocity_m_s: state.as_slice()[3..].to_vec(),
                 })),
                 elapsed_s: Some(hill.sample_time_s * self.commands as f64),
+                ..Measurement::default()
             },
             Kind::Linear(_) => Measurement {
                 state: Some(measurement::State::Linear(v1::LinearState {
                     components: state.as_slice().to_vec(),
                 })),
-                elapsed_s: None,
+                ..Measurement::default()
             },
         }
     }
@@ -527,6 +528,7 @@ impl Session {
         }
         match &response.verdict {
             None => Err("a step without a verdict".into()),
+            Some(step_response::Verdict::Abort(_)) => Err("an abort where none is to be had".into()),
             Some(step_response::Verdict::Infeasible(why)) => {
                 Ok(Decision::Infeasible(why.reason.clone()))
             }

@@ -347,7 +347,7 @@ pub(crate) fn scheme_name(scheme: Scheme) -> &'static str {
 pub(crate) fn variable_horizon(problem: &v1::Problem) -> Option<&v1::VariableHorizonProblem> {
     match &problem.method {
         Some(v1::problem::Method::VariableHorizon(inner)) => Some(inner),
-        Some(v1::problem::Method::DisturbanceFeedback(_)) | None => None,
+        _ => None,
     }
 }
 
@@ -357,7 +357,7 @@ pub(crate) fn variable_horizon_mut(
 ) -> Option<&mut v1::VariableHorizonProblem> {
     match &mut problem.method {
         Some(v1::problem::Method::VariableHorizon(inner)) => Some(inner),
-        Some(v1::problem::Method::DisturbanceFeedback(_)) | None => None,
+        _ => None,
     }
 }
 

@@ -313,7 +313,7 @@ pub(crate) fn disturbance_feedback(
 ) -> Option<&v1::DisturbanceFeedbackProblem> {
     match &problem.method {
         Some(v1::problem::Method::DisturbanceFeedback(inner)) => Some(inner),
-        Some(v1::problem::Method::VariableHorizon(_)) | None => None,
+        _ => None,
     }
 }
 
@@ -323,7 +323,7 @@ fn disturbance_feedback_mut(
 ) -> Option<&mut v1::DisturbanceFeedbackProblem> {
     match &mut problem.method {
         Some(v1::problem::Method::DisturbanceFeedback(inner)) => Some(inner),
-        Some(v1::problem::Method::VariableHorizon(_)) | None => None,
+        _ => None,
     }
 }
 

@@ -24,7 +24,7 @@ impl Mission {
             }
             InitialLaw::InCone { .. } | InitialLaw::Box { .. } => return None,
         };
-        Some(Measurement { state: Some(state), elapsed_s })
+        Some(Measurement { state: Some(state), elapsed_s, ..Measurement::default() })
     }
 
     /// The same mission under another controller.

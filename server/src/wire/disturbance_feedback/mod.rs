@@ -1,14 +1,14 @@
 //! Disturbance feedback: `vbar/v1/disturbance_feedback.proto` and
 //! `vbar_guidance::control::disturbance_feedback`.
 
+mod answer;
 mod claim;
 mod plan;
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::DMatrix;
 use vbar_guidance::{
     control::disturbance_feedback::{
-        self as method, ArrivalMetric, BurnCommand, Diagnostics, EFFORT_WEIGHT_DEFAULT,
-        FUEL_WEIGHT_DEFAULT, Instants, Plan, Step, Verdict,
+        self as method, ArrivalMetric, EFFORT_WEIGHT_DEFAULT, FUEL_WEIGHT_DEFAULT, Instants,
     },
     frames::{LvlhCcsds, RTN_FROM_LVLH_CCSDS, RelativeState, Rtn},
     orbit::KeplerOrbit,
@@ -19,16 +19,16 @@ use vbar_proto::v1;
 
 use super::{
     Door, Parse, Path, count,
-    orbits::{Target, calendar_after, components, initial_state, render_target},
+    orbits::{Target, components, initial_state, render_target},
     types::{
-        Axes, ElapsedAndState, MeasuredState, Size, integer, list, matrix, not_negative, positive,
-        relative_state, render_certificate, render_matrix, render_vectors, unknown_enum,
+        Axes, Size, integer, list, matrix, not_negative, positive, relative_state, render_matrix,
+        unknown_enum,
     },
 };
 
 pub(crate) use claim::Claimed;
 pub(super) use plan::{
-    render_certificate as render_plan_certificate, render_line, render_plan, wrapped,
+    render_certificate as render_plan_certificate, render_document, render_line,
 };
 
 /// Longest mission: three years. Epochs and anomalies keep their digits well beyond.
@@ -286,7 +286,7 @@ fn metric(value: i32, path: Path<'_>, door: &mut Door) -> Option<ArrivalMetric> 
 
 /// Writes a mission in one form, whatever form it was read from: orbits with elements, states
 /// relative, errors as shapes, everything in `LVLH_CCSDS`. Reading it gives the same mission.
-pub(super) fn render_problem(problem: &method::Problem) -> v1::DisturbanceFeedbackProblem {
+fn render_problem(problem: &method::Problem) -> v1::DisturbanceFeedbackProblem {
     let error = |set: &Ellipsoid| v1::NavigationError {
         form: Some(v1::navigation_error::Form::Shape(v1::ErrorShape {
             frame: v1::Frame::LvlhCcsds.into(),
@@ -342,97 +342,5 @@ fn render_state(state: &RelativeState<LvlhCcsds>) -> v1::RelativeState {
         frame: v1::Frame::LvlhCcsds.into(),
         position_m: components(&state.position_m.components),
         velocity_m_s: components(&state.velocity_m_s.components),
-    }
-}
-
-/// The measurement as this method takes it; `None` for one of a general linear plant.
-pub(super) fn measurement(measured: &ElapsedAndState) -> Option<method::Measurement> {
-    match &measured.state {
-        MeasuredState::Relative(state) => {
-            Some(method::Measurement { state: in_lvlh(state), elapsed: measured.elapsed })
-        }
-        MeasuredState::Linear(_) => None,
-    }
-}
-
-/// Everything of a step's answer but what the envelope knows: controller state, provenance.
-pub(super) fn render_step(plan: &Plan, step: &Step, omit_prediction: bool) -> v1::StepResponse {
-    use v1::step_response::{Diagnostics as Message, Verdict as VerdictMessage};
-    let (verdict, level) = match &step.verdict {
-        Verdict::Burn(burn) => (VerdictMessage::Command(render_command(plan, burn)), None),
-        Verdict::Arrived(arrival) => {
-            let message = v1::Arrival {
-                completion_steps: count(arrival.burns),
-                distance_m: Some(arrival.distance_m),
-                deviation_norm_nd: arrival.deviation_norm,
-                inside_guaranteed_set: arrival.inside_guaranteed_set,
-            };
-            (VerdictMessage::Arrived(message), Some(arrival.level))
-        }
-    };
-    let disturbance = step.disturbance.as_ref().map(|disturbance| v1::RealisedDisturbance {
-        components_nd: disturbance.components.iter().copied().collect(),
-        gauge: Some(disturbance.gauge),
-        residual_norm_nd: 0.0,
-        outside_assumed_set: disturbance.outside_assumed_set,
-        steps: 1,
-        outside_guaranteed_tube: disturbance.outside_assumed_set,
-    });
-    v1::StepResponse {
-        controller_state: bytes::Bytes::new(),
-        step_index: count(step.index),
-        prediction: (!omit_prediction).then(|| render_prediction(plan, step.index)),
-        certificate: step.certificate.as_ref().map(|c| render_certificate(c, None)),
-        realised_disturbance: disturbance,
-        provenance: None,
-        verdict: Some(verdict),
-        diagnostics: Some(Message::DisturbanceFeedback(render_diagnostics(
-            &step.diagnostics,
-            level,
-        ))),
-    }
-}
-
-fn render_command(plan: &Plan, burn: &BurnCommand) -> v1::Command {
-    let epoch = plan.problem().epoch.as_ref();
-    v1::Command {
-        elapsed_s: burn.elapsed.seconds(),
-        frame: v1::Frame::LvlhCcsds.into(),
-        delta_v_m_s: components(&burn.delta_v_m_s),
-        epoch: epoch.map(|epoch| calendar_after(epoch, burn.elapsed)).unwrap_or_default(),
-        last: burn.last,
-        ..v1::Command::default()
-    }
-}
-
-fn render_diagnostics(
-    diagnostics: &Diagnostics,
-    arrival_level: Option<f64>,
-) -> v1::DisturbanceFeedbackDiagnostics {
-    v1::DisturbanceFeedbackDiagnostics {
-        nominal_delta_v_m_s: components(&diagnostics.nominal_delta_v_m_s),
-        correction_m_s: components(&diagnostics.correction_m_s),
-        clipped: diagnostics.clipped,
-        deviation_gauge: diagnostics.deviation_gauge,
-        arrival_level,
-    }
-}
-
-/// The planned states from this instant on, in RTN as every prediction is.
-fn render_prediction(plan: &Plan, index: usize) -> v1::Prediction {
-    let ahead: Vec<RelativeState<Rtn>> = plan
-        .outcome()
-        .states
-        .iter()
-        .skip(index)
-        .map(|planned| planned.state.rotated(RTN_FROM_LVLH_CCSDS))
-        .collect();
-    let rows = |pick: fn(&RelativeState<Rtn>) -> Vector3<f64>| {
-        Some(render_vectors(&ahead.iter().map(pick).collect::<Vec<_>>()))
-    };
-    v1::Prediction {
-        positions_m: rows(|state| state.position_m.components),
-        velocities_m_s: rows(|state| state.velocity_m_s.components),
-        ..v1::Prediction::default()
     }
 }

@@ -9,7 +9,7 @@ use vbar_guidance::{
 };
 use vbar_proto::v1;
 
-use super::render_state;
+use super::{render_problem, render_state};
 use crate::wire::{
     count,
     orbits::{calendar_after, components, render_epoch},
@@ -17,7 +17,7 @@ use crate::wire::{
 };
 
 /// Writes a plan: burns, gains, and everything that follows from them.
-pub(in crate::wire) fn render_plan(plan: &Plan) -> v1::DisturbanceFeedbackPlan {
+pub(super) fn render_plan(plan: &Plan) -> v1::DisturbanceFeedbackPlan {
     let outcome = plan.outcome();
     let epoch = plan.problem().epoch.as_ref();
     v1::DisturbanceFeedbackPlan {
@@ -42,8 +42,15 @@ pub(in crate::wire) fn render_plan(plan: &Plan) -> v1::DisturbanceFeedbackPlan {
 }
 
 /// Writes a plan as the one arm of the message that every method's plans share.
-pub(in crate::wire) fn wrapped(plan: &Plan) -> v1::Plan {
+pub(super) fn wrapped(plan: &Plan) -> v1::Plan {
     v1::Plan { disturbance_feedback: Some(render_plan(plan)), ..v1::Plan::default() }
+}
+
+/// Writes a plan with its mission.
+pub(in crate::wire) fn render_document(plan: &Plan) -> v1::PlanDocument {
+    let method = v1::problem::Method::DisturbanceFeedback(render_problem(plan.problem()));
+    let problem = Some(v1::Problem { method: Some(method) });
+    v1::PlanDocument { problem, plan: Some(wrapped(plan)) }
 }
 
 /// Writes a plan in one line, but for its id and size.

@@ -364,6 +364,7 @@ impl<'a> Session<'a> {
                 velocity_m_s: measured.as_slice()[3..].to_vec(),
             })),
             elapsed_s: Some(self.flyable.model.elapsed_s[k]),
+            ..Measurement::default()
         };
         let asked = Instant::now();
         let mut patience = Patience::new(self.run);
@@ -398,6 +399,7 @@ impl<'a> Session<'a> {
         }
         match &response.verdict {
             None => Err("a step without a verdict".into()),
+            Some(step_response::Verdict::Abort(_)) => Err("an abort where none is to be had".into()),
             Some(step_response::Verdict::Infeasible(why)) => {
                 Err(format!("a plan that cannot be flown: {}", why.reason))
             }

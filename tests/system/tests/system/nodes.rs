@@ -78,6 +78,7 @@ fn next_measurement(answer: &StepResponse) -> Option<Measurement> {
     Some(Measurement {
         state: Some(vbar_client::v1::measurement::State::Relative(state)),
         elapsed_s: Some(command.elapsed_s + command.duration_s.unwrap()),
+        ..Measurement::default()
     })
 }
 
