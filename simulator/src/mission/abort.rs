@@ -315,6 +315,12 @@ impl AbortMission {
 }
 
 impl AbortCase {
+    /// What a force held for a step costs: the sum over the axes, as the paper counts.
+    pub(crate) fn delta_v_m_s(&self, force_n: &[f64; 3]) -> f64 {
+        let impulse: f64 = force_n.iter().map(|force| force.abs()).sum();
+        impulse * self.model.sample_time_s / self.model.mass_kg
+    }
+
     /// Longest flight, steps.
     pub(crate) fn steps_max(&self) -> u32 {
         self.steps.unwrap_or(self.model.steps_max)
@@ -337,6 +343,17 @@ impl AbortCase {
 }
 
 impl AbortTruth {
+    /// As in reports.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Linear => "linear",
+            Self::Nonlinear { j2: false, sun_moon: false } => "nonlinear",
+            Self::Nonlinear { j2: true, sun_moon: false } => "nonlinear_j2",
+            Self::Nonlinear { j2: false, sun_moon: true } => "nonlinear_sun_moon",
+            Self::Nonlinear { j2: true, sun_moon: true } => "nonlinear_j2_sun_moon",
+        }
+    }
+
     fn check(self, place: &str, model: &AbortModel, faults: &mut Vec<String>) {
         let Self::Nonlinear { j2, sun_moon } = self else { return };
         if (j2 || sun_moon) && !model.oriented {

@@ -69,8 +69,8 @@ pub struct AbortStep {
     pub force_n: [f64; 3],
     /// The phase it was decided in.
     pub phase: usize,
-    /// It belongs to an abort.
-    pub abort: Option<AbortReason>,
+    /// Where its force comes from.
+    pub origin: Origin,
     /// Some half-space had to give way.
     pub softened: bool,
     /// The certificate passed; aborts have none.
@@ -79,6 +79,28 @@ pub struct AbortStep {
     pub next: ModeCounts,
     /// From question to answer, as the client sees it.
     pub latency: Duration,
+}
+
+impl std::iter::Sum for ModeCounts {
+    fn sum<I: Iterator<Item = Self>>(counts: I) -> Self {
+        counts.fold(Self::default(), |sum, one| Self {
+            inside: sum.inside + one.inside,
+            found: sum.found + one.found,
+            none_proved: sum.none_proved + one.none_proved,
+            undecided: sum.undecided + one.undecided,
+        })
+    }
+}
+
+/// Where the force of a step comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// The regulator's command.
+    Command,
+    /// An abort in the service's answer.
+    Abort(AbortReason),
+    /// The rest of the last abort, or nothing: the service had no answer.
+    Rest,
 }
 
 /// Verdicts on a state, counted over the modes that must be survived.
@@ -128,6 +150,27 @@ impl AbortFlight {
     #[must_use]
     pub fn steps_before_failure(&self) -> usize {
         self.failure.as_ref().map_or(self.steps.len(), |failure| failure.step)
+    }
+
+    /// First step at which a phase (or a later one) decided.
+    #[must_use]
+    pub fn begins_at(&self, phase: usize) -> Option<usize> {
+        self.steps.iter().position(|step| step.phase >= phase)
+    }
+
+    /// First step at which the state is in an unsafe set of a phase; `None` where nobody asked.
+    #[must_use]
+    pub fn unsafe_at(&self, phase: usize) -> Option<Option<usize>> {
+        let asked = self.samples.first()?.unsafe_sets.len() > phase;
+        asked.then(|| self.samples.iter().position(|sample| sample.unsafe_sets[phase]))
+    }
+
+    /// The state enters the unsafe sets of a phase only after the next one has begun
+    /// [AguilarMarsillach2022, fig. 16].
+    #[must_use]
+    pub fn safe_until_next(&self, phase: usize) -> bool {
+        let Some(Some(inside)) = self.unsafe_at(phase) else { return true };
+        self.begins_at(phase + 1).is_some_and(|next| inside > next)
     }
 
     /// What was flown after a failure came inside the region, by the first truth of the mission
@@ -219,13 +262,13 @@ impl Leg<'_> {
     ) -> Result<Option<AbortOutcome>, SimulationError> {
         let decision = self.session.decide(k, &self.state, None).await?;
         flight.samples.push(self.sample(decision.phase));
-        let (force, reason) = match &decision.what {
+        let (force, origin) = match &decision.what {
             Decided::Arrived => return Ok(Some(AbortOutcome::Arrived)),
             Decided::Infeasible(why) => return Ok(Some(AbortOutcome::Infeasible(why.clone()))),
-            Decided::Force(force) => (*force, None),
-            Decided::Abort(reason, forces) => (forces[0], Some(*reason)),
+            Decided::Force(force) => (*force, Origin::Command),
+            Decided::Abort(reason, forces) => (forces[0], Origin::Abort(*reason)),
         };
-        flight.steps.push(flown(&decision, &force, reason));
+        flight.steps.push(flown(&decision, &force, origin));
         self.advance(k, &force).await?;
         Ok(None)
     }
@@ -263,24 +306,24 @@ impl Leg<'_> {
             let decision = self.session.decide(k + step, &self.state, Some(&law.working)).await?;
             phase = decision.phase;
             flight.samples.push(self.sample(phase));
-            let (force, reason) = match &decision.what {
+            let (force, origin) = match &decision.what {
                 Decided::Abort(reason, sequence) => {
                     self.rest = sequence[1..].iter().rev().copied().collect();
-                    (sequence[0], Some(*reason))
+                    (sequence[0], Origin::Abort(*reason))
                 }
-                Decided::Force(force) => (*force, None),
+                Decided::Force(force) => (*force, Origin::Command),
                 Decided::Infeasible(_) | Decided::Arrived => {
                     failure.steps_without_abort += 1;
-                    (self.rest.pop().unwrap_or_default(), None)
+                    (self.rest.pop().unwrap_or_default(), Origin::Rest)
                 }
             };
-            if step == 0 {
-                failure.abort = reason;
+            if let (0, Origin::Abort(reason)) = (step, origin) {
+                failure.abort = Some(reason);
             }
             if total {
                 break;
             }
-            flight.steps.push(flown(&decision, &force, reason));
+            flight.steps.push(flown(&decision, &force, origin));
             forces.push(force);
             self.advance(k + step, &force).await?;
         }
@@ -295,11 +338,11 @@ impl Leg<'_> {
     }
 }
 
-fn flown(decision: &Decision, force: &Vector3<f64>, abort: Option<AbortReason>) -> AbortStep {
+fn flown(decision: &Decision, force: &Vector3<f64>, origin: Origin) -> AbortStep {
     AbortStep {
         force_n: (*force).into(),
         phase: decision.phase,
-        abort,
+        origin,
         softened: decision.softened,
         certified: decision.certified,
         next: decision.next,

@@ -13,10 +13,10 @@ use vbar_proto::v1::{self, artifact::Summary, precompute_response::Outcome};
 
 use super::{Progress, SimulationError, concurrency, crew::Crew, flight::Patience};
 use crate::{
-    mission::{AbortCase, AbortMission, RUNS_MAX, abort::AbortSimulation},
+    mission::{AbortCase, AbortMission, RUNS_MAX, abort::{AbortSimulation, AbortTruth}},
     report::abort::AbortReport,
 };
-pub use flight::{AbortFlight, AbortOutcome, AbortSample, AbortStep, FlownFailure, ModeCounts};
+pub use flight::{AbortFlight, AbortOutcome, AbortSample, AbortStep, FlownFailure, ModeCounts, Origin};
 use judge::{Judge, World};
 pub use judge::{Drift, UnsafeSets};
 
@@ -44,6 +44,8 @@ pub struct AbortCampaign {
     pub artifact_bytes: i64,
     /// In order of run number.
     pub flights: Vec<AbortFlight>,
+    /// What drifts are judged under.
+    pub(crate) judged_by: Vec<AbortTruth>,
 }
 
 /// Flies a mission's variants against a node and measures what comes out.
@@ -104,6 +106,7 @@ async fn fly_case(
         artifact: made.artifact,
         artifact_bytes: made.size_bytes,
         flights,
+        judged_by: mission.simulation.drift.truths.clone(),
     })
 }
 
