@@ -32,8 +32,8 @@ pub use campaign::{
     simulate,
 };
 pub use mission::{
-    AbortCase, AbortMission, AbortSources, Mission, MissionError, MissionFile, PlanChanges, PlanMission, Published, PublishedAxes,
-    RUNS_MAX, metric_name, metric_named,
+    AbortCase, AbortMission, AbortSources, Mission, MissionError, MissionFile, PlanChanges,
+    PlanMission, Published, PublishedAxes, RUNS_MAX, metric_name, metric_named,
 };
 pub use pictures::{PictureError, draw, plan::draw_plans};
 pub use report::{

@@ -528,7 +528,9 @@ impl Session {
         }
         match &response.verdict {
             None => Err("a step without a verdict".into()),
-            Some(step_response::Verdict::Abort(_)) => Err("an abort where none is to be had".into()),
+            Some(step_response::Verdict::Abort(_)) => {
+                Err("an abort where none is to be had".into())
+            }
             Some(step_response::Verdict::Infeasible(why)) => {
                 Ok(Decision::Infeasible(why.reason.clone()))
             }

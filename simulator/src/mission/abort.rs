@@ -255,7 +255,11 @@ impl AbortMission {
             published: variant.published.clone(),
             reference: variant.reference.clone(),
             steps: variant.steps,
-            initial_state: variant.initial_state.as_ref().unwrap_or(&simulation.initial_state).clone(),
+            initial_state: variant
+                .initial_state
+                .as_ref()
+                .unwrap_or(&simulation.initial_state)
+                .clone(),
             truth: variant.truth.unwrap_or(simulation.truth),
             failure: variant.failure.as_ref().or(simulation.failure.as_ref()).cloned(),
             model,
@@ -395,11 +399,7 @@ impl FailureLaw {
     fn check(&self, place: &str, own: &AbortModel, faults: &mut Vec<String>) {
         if self.working.iter().any(|thruster| !own.thrusters.contains(thruster)) {
             let known = &own.thrusters;
-            faults.push(format!(
-                "{place}.working: thrusters {} to {}",
-                known.start(),
-                known.end()
-            ));
+            faults.push(format!("{place}.working: thrusters {} to {}", known.start(), known.end()));
         }
         if let FailureMoment::AtGauge([low, high]) = self.when {
             if !(low.is_finite() && high.is_finite() && 1.0 <= low && low <= high) {

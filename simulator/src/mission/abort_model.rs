@@ -101,16 +101,7 @@ impl AbortModel {
         if !faults.is_empty() {
             return Err(faults);
         }
-        Ok(Self {
-            elements,
-            oriented,
-            epoch,
-            mass_kg,
-            sample_time_s,
-            thrusters,
-            phases,
-            steps_max,
-        })
+        Ok(Self { elements, oriented, epoch, mass_kg, sample_time_s, thrusters, phases, steps_max })
     }
 
     /// The region that the first phase avoids, if it avoids any.
@@ -137,7 +128,9 @@ fn epoch(given: &v1::Epoch, faults: &mut Vec<String>) -> Option<Epoch> {
     };
     let moment = scale.and_then(|scale| format!("{} {scale}", given.calendar).parse().ok());
     if moment.is_none() {
-        faults.push(format!("{HERE}.orbit.epoch: a calendar such as 2027-03-01T12:00:00 and its scale"));
+        faults.push(format!(
+            "{HERE}.orbit.epoch: a calendar such as 2027-03-01T12:00:00 and its scale"
+        ));
     }
     moment
 }

@@ -23,9 +23,9 @@ use vbar_proto::{
     v1::{self, VariableHorizonScheme as Scheme},
 };
 
+pub use abort::{AbortCase, AbortMission, AbortSources};
 use law::{DisturbanceLaw, InitialLaw, Randomisation, TruthLaw};
 use model::Model;
-pub use abort::{AbortCase, AbortMission, AbortSources};
 pub use plan::{PlanChanges, PlanMission, PublishedAxes, metric_name, metric_named};
 
 /// Largest mission file that is read.
@@ -66,11 +66,11 @@ impl MissionFile {
             problem: BTreeMap<String, serde::de::IgnoredAny>,
         }
         let head: Head = serde_json::from_str(text)?;
-        let names = |arms: [&str; 2]| arms.iter().any(|arm| head.problem.contains_key(*arm));
-        if names(["abortSafe", "abort_safe"]) {
+        let asks = |arms: [&str; 2]| arms.iter().any(|arm| head.problem.contains_key(*arm));
+        if asks(["abortSafe", "abort_safe"]) {
             return AbortMission::parse(text).map(|mission| Self::AbortSafe(mission.into()));
         }
-        if names(["disturbanceFeedback", "disturbance_feedback"]) {
+        if asks(["disturbanceFeedback", "disturbance_feedback"]) {
             return PlanMission::parse(text)
                 .map(|mission| Self::DisturbanceFeedback(mission.into()));
         }

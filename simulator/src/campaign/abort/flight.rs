@@ -361,11 +361,8 @@ async fn judge(
     if flyable.case.failure.is_some() {
         return Ok(flight);
     }
-    let states: Vec<(Vector6<f64>, usize)> = flight
-        .samples
-        .iter()
-        .map(|sample| (Vector6::from(sample.state), sample.phase))
-        .collect();
+    let states: Vec<(Vector6<f64>, usize)> =
+        flight.samples.iter().map(|sample| (Vector6::from(sample.state), sample.phase)).collect();
     let drifts = drifts(flyable, &states).await?;
     for (sample, drifts) in flight.samples.iter_mut().zip(drifts) {
         sample.drifts = drifts;

@@ -58,7 +58,12 @@ impl World {
     }
 
     /// The state one step after `state`, which holds at step `k`, under a force held along RTN.
-    pub(crate) fn advance(&self, k: u32, state: &Vector6<f64>, force_n: &Vector3<f64>) -> Vector6<f64> {
+    pub(crate) fn advance(
+        &self,
+        k: u32,
+        state: &Vector6<f64>,
+        force_n: &Vector3<f64>,
+    ) -> Vector6<f64> {
         let time_s = f64::from(k) * self.step_s;
         self.truth.advance(time_s, state, self.step_s, &(force_n / self.mass_kg))
     }
@@ -97,7 +102,9 @@ impl Judge {
     /// mission; none in phases that do not promise to survive that.
     pub(crate) fn drifts(&self, k: u32, state: &Vector6<f64>, phase: usize) -> Vec<Drift> {
         match self.own.phases.get(phase) {
-            Some(phase) if phase.kind == PhaseKind::Passive => self.after(k, state, phase.region.as_ref(), &[]),
+            Some(phase) if phase.kind == PhaseKind::Passive => {
+                self.after(k, state, phase.region.as_ref(), &[])
+            }
             _ => Vec::new(),
         }
     }

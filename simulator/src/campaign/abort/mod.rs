@@ -13,12 +13,17 @@ use vbar_proto::v1::{self, artifact::Summary, precompute_response::Outcome};
 
 use super::{Progress, SimulationError, concurrency, crew::Crew, flight::Patience};
 use crate::{
-    mission::{AbortCase, AbortMission, RUNS_MAX, abort::{AbortSimulation, AbortTruth}},
+    mission::{
+        AbortCase, AbortMission, RUNS_MAX,
+        abort::{AbortSimulation, AbortTruth},
+    },
     report::abort::AbortReport,
 };
-pub use flight::{AbortFlight, AbortOutcome, AbortSample, AbortStep, FlownFailure, ModeCounts, Origin};
-use judge::{Judge, World};
+pub use flight::{
+    AbortFlight, AbortOutcome, AbortSample, AbortStep, FlownFailure, ModeCounts, Origin,
+};
 pub use judge::{Drift, UnsafeSets};
+use judge::{Judge, World};
 
 /// What to fly; the default flies the mission as its file says.
 #[derive(Debug, Clone, Default)]
@@ -67,7 +72,8 @@ pub async fn fly_aborts(
         Some(name) => vec![name.as_str()],
         None => mission.variants().collect(),
     };
-    let cases: Result<Vec<AbortCase>, _> = names.into_iter().map(|name| mission.case(name)).collect();
+    let cases: Result<Vec<AbortCase>, _> =
+        names.into_iter().map(|name| mission.case(name)).collect();
     let cases = cases.map_err(|fault| SimulationError::Options(fault.to_string()))?;
     let concurrency = concurrency(client, options.concurrency).await?;
     let crew = Crew { concurrency, client, progress };

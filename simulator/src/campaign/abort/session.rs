@@ -155,16 +155,13 @@ fn force(command: &v1::Command) -> Result<Vector3<f64>, String> {
 fn sequence(abort: &v1::AbortCommand) -> Result<Vec<Vector3<f64>>, String> {
     let first = force(abort.command.as_ref().ok_or("an abort without a command")?)?;
     let given = abort.sequence.as_ref().ok_or("an abort without its sequence")?;
-    if given.idle {
-        return match first.norm() == 0.0 {
-            true => Ok(vec![first]),
-            false => Err("an idle abort that thrusts".into()),
-        };
+    let rows = given.forces_n.as_ref().map_or(&[][..], |rows| &rows.values);
+    let forces: Option<Vec<_>> = rows.chunks(3).map(three).collect();
+    let mut forces = forces.ok_or("an abort whose forces are not three numbers a step")?;
+    if forces.is_empty() {
+        // Drift from here on.
+        forces.push(Vector3::zeros());
     }
-    let rows = given.forces_n.as_ref().ok_or("an abort without its forces")?;
-    let forces: Option<Vec<_>> = rows.values.chunks(3).map(three).collect();
-    let forces = forces.filter(|forces| rows.columns == 3 && !forces.is_empty());
-    let forces = forces.ok_or("an abort whose forces are not one row of three a step")?;
     let largest = forces.iter().map(Vector3::norm).fold(0.0, f64::max);
     if (forces[0] - first).norm() > AGREEMENT * largest {
         return Err(format!("an abort that begins with {first:?}, not with {:?}", forces[0]));

@@ -28,7 +28,9 @@ pub(super) struct Start {
 pub(super) fn draw(flyable: &Flyable, run: u32) -> Result<Start, SimulationError> {
     let mut chance = stream_of_chance(flyable.seed, run, 0);
     let failure_gauge = match flyable.case.failure.as_ref().map(|failure| failure.when) {
-        Some(FailureMoment::AtGauge([low, high])) => Some(low + (high - low) * chance.random::<f64>()),
+        Some(FailureMoment::AtGauge([low, high])) => {
+            Some(low + (high - low) * chance.random::<f64>())
+        }
         Some(FailureMoment::AtStep(_)) | None => None,
     };
     match &flyable.case.initial_state {

@@ -399,7 +399,9 @@ impl<'a> Session<'a> {
         }
         match &response.verdict {
             None => Err("a step without a verdict".into()),
-            Some(step_response::Verdict::Abort(_)) => Err("an abort where none is to be had".into()),
+            Some(step_response::Verdict::Abort(_)) => {
+                Err("an abort where none is to be had".into())
+            }
             Some(step_response::Verdict::Infeasible(why)) => {
                 Err(format!("a plan that cannot be flown: {}", why.reason))
             }

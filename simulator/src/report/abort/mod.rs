@@ -11,7 +11,6 @@ use std::{
 
 use serde_json::{Map, Value, json};
 
-use super::Statistics;
 use crate::{
     campaign::abort::{AbortCampaign, AbortFlight, AbortOutcome, AbortSample, AbortStep, Origin},
     mission::AbortMission,

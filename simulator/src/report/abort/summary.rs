@@ -118,9 +118,7 @@ impl AbortSummary {
             metrics: metrics(campaign),
             steps: steps().count(),
             softened_steps: steps().filter(|step| step.softened).count(),
-            abort_steps: steps()
-                .filter(|step| matches!(step.origin, Origin::Abort(_)))
-                .count(),
+            abort_steps: steps().filter(|step| matches!(step.origin, Origin::Abort(_))).count(),
             uncertified_steps: steps()
                 .filter(|step| !step.certified && step.origin == Origin::Command)
                 .count(),
@@ -145,16 +143,18 @@ fn metrics(campaign: &AbortCampaign) -> Vec<(&'static str, Statistics)> {
     let flights = || campaign.flights.iter();
     let after = |value: fn(&Drift) -> f64| {
         let each = flights().filter_map(|flight| flight.failure.as_ref());
-        Statistics::of(each.filter_map(move |failure| {
-            failure.after.iter().map(value).reduce(f64::min)
-        }))
+        Statistics::of(
+            each.filter_map(move |failure| failure.after.iter().map(value).reduce(f64::min)),
+        )
     };
     let all = [
         ("delta_v_m_s", Statistics::of(flights().map(|flight| flight.delta_v_m_s(&campaign.case)))),
         ("steps", Statistics::of(flights().map(|flight| flight.steps.len() as f64))),
         (
             "failure_step",
-            Statistics::of(flights().filter_map(|flight| Some(flight.failure.as_ref()?.step as f64))),
+            Statistics::of(
+                flights().filter_map(|flight| Some(flight.failure.as_ref()?.step as f64)),
+            ),
         ),
         (
             "failure_gauge",
@@ -203,9 +203,8 @@ fn failures(flights: &[AbortFlight]) -> Option<FailureFigures> {
 fn phase_figures(campaign: &AbortCampaign, phase: usize) -> PhaseFigures {
     let made = &campaign.artifact.phases[phase];
     let flights = &campaign.flights;
-    let steps = || {
-        flights.iter().flat_map(|flight| &flight.steps).filter(move |step| step.phase == phase)
-    };
+    let steps =
+        || flights.iter().flat_map(|flight| &flight.steps).filter(move |step| step.phase == phase);
     let kind = campaign.case.model.phases.get(phase).map_or(PhaseKind::Free, |phase| phase.kind);
     let first = flights.first();
     let asked = flights.iter().any(|flight| flight.unsafe_at(phase).is_some());
