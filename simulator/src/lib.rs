@@ -11,6 +11,7 @@
 //! published figures; [`draw`] and [`draw_plans`] make pictures of it.
 
 mod campaign;
+mod clearance;
 mod mission;
 mod pictures;
 mod plant;
@@ -52,6 +53,14 @@ mod tests {
     pub(crate) fn golden_cases(file: &str) -> Vec<serde_json::Value> {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/variable_horizon");
         let path = format!("{folder}/{file}");
+        let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
+        serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
+    }
+
+    /// One case of abort safety (see `tests/golden/abort_safe`).
+    pub(crate) fn abort_case(name: &str) -> serde_json::Value {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/abort_safe");
+        let path = format!("{folder}/{name}.json");
         let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
         serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
     }
