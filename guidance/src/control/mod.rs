@@ -19,11 +19,13 @@ pub enum Method {
     VariableHorizon,
     /// Fixed-time rendezvous plans with disturbance feedback.
     DisturbanceFeedback,
+    /// Rendezvous that can be aborted at every step.
+    AbortSafe,
 }
 
 impl Method {
     /// Every method.
-    pub const ALL: [Self; 2] = [Self::VariableHorizon, Self::DisturbanceFeedback];
+    pub const ALL: [Self; 3] = [Self::VariableHorizon, Self::DisturbanceFeedback, Self::AbortSafe];
 
     /// Name on the wire and in identifiers.
     #[must_use]
@@ -31,6 +33,7 @@ impl Method {
         match self {
             Self::VariableHorizon => "variable_horizon",
             Self::DisturbanceFeedback => "disturbance_feedback",
+            Self::AbortSafe => "abort_safe",
         }
     }
 
@@ -40,13 +43,14 @@ impl Method {
         match self {
             Self::VariableHorizon => variable_horizon::VERSION,
             Self::DisturbanceFeedback => disturbance_feedback::VERSION,
+            Self::AbortSafe => abort_safe::VERSION,
         }
     }
 }
 
 /// Folders of methods whose mathematics stands here and that no node serves yet: contract, wire and
 /// missions are to come. A served method leaves this list for [`Method`]; `tidy` knows both.
-pub const NOT_YET_SERVED: [&str; 2] = ["abort_safe", "offline_sampling"];
+pub const NOT_YET_SERVED: [&str; 1] = ["offline_sampling"];
 
 /// A method: think long once (`prepare` in shards, then `merge`), then decide fast many times.
 ///

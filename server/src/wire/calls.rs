@@ -153,6 +153,10 @@ impl Parse for PlanCall {
                 door.refuse(place, "nothing: the problem has its initial state", "a measurement")
             }
             (Some(Planning::IsArtifact), None) => Some(None),
+            (Some(Planning::Stepwise), _) => {
+                let expected = "a method that plans: variable_horizon, disturbance_feedback";
+                door.refuse(path.field("problem"), expected, "one that decides step by step")
+            }
             (_, initial) => door.message(initial, place).map(Some),
         };
         Some(Self { problem: problem?, initial: initial?, validate_only: message.validate_only })

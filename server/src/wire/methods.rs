@@ -10,6 +10,7 @@ use vbar_guidance::{
     Budget, Method,
     control::{
         Certificate, Controller, Failure, Fault, Infeasibility, PrepareError, StepError,
+        abort_safe::{self, AbortSafe},
         disturbance_feedback::{self, DisturbanceFeedback},
         variable_horizon::VariableHorizon,
     },
@@ -37,6 +38,8 @@ pub(super) trait Wired:
     const METHOD: Method;
     /// What `ComputePlan` means for it.
     const PLANNING: Planning;
+    /// Whether measurements may say that thrusters have failed.
+    const SEES_FAILURES: bool = false;
 
     /// Our own encoding of the parsed values; its digest names the problem.
     fn canonical_bytes(problem: &Self::Problem) -> Vec<u8>;
@@ -53,6 +56,11 @@ pub(super) trait Wired:
     fn render_summary(artifact: &Self::Artifact) -> v1::artifact::Summary;
     /// The artifact as a plan that can be kept and flown, if that is what it is.
     fn as_plan(_artifact: &Self::Artifact) -> Option<&disturbance_feedback::Plan> {
+        None
+    }
+
+    /// The artifact as one that safety reports are made with, if that is what it is.
+    fn as_abort_safe(_artifact: &Self::Artifact) -> Option<&abort_safe::Artifact> {
         None
     }
 
@@ -82,12 +90,15 @@ pub(super) trait Wired:
     ) -> v1::StepResponse;
 
     /// Computes a plan to fly without re-optimising; `initial` is there if
-    /// [`Planning::FromMeasurement`].
+    /// [`Planning::FromMeasurement`]. Not asked of a method that is [`Planning::Stepwise`].
     fn plan(
-        artifact: &Self::Artifact,
-        initial: Option<&ElapsedAndState>,
-        budget: Budget<'_>,
-    ) -> Result<PlanVerdict, StepError>;
+        _artifact: &Self::Artifact,
+        _initial: Option<&ElapsedAndState>,
+        _budget: Budget<'_>,
+    ) -> Result<PlanVerdict, StepError> {
+        let what = format!("{} decides step by step and has no plan", Self::METHOD.name());
+        Err(Failure::Numerical(what).into())
+    }
 }
 
 /// What `ComputePlan` means for a method.
@@ -97,6 +108,8 @@ pub(crate) enum Planning {
     FromMeasurement,
     /// Its artifact is the plan; the problem has its initial state.
     IsArtifact,
+    /// It decides step by step: there is no plan to fly without asking again.
+    Stepwise,
 }
 
 /// A plan, or why there is none.
@@ -139,9 +152,12 @@ pub(crate) struct SolverWork {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum VerdictKind {
     Command,
+    Abort,
     Arrived,
     Infeasible,
 }
+
+const METHODS: &str = "one of variable_horizon, disturbance_feedback, abort_safe";
 
 /// A mission.
 #[derive(Debug, Clone)]
@@ -152,16 +168,15 @@ impl Parse for Problem {
 
     fn parse(message: &v1::Problem, path: Path<'_>, door: &mut Door) -> Option<Self> {
         match &message.method {
-            None => door.refuse(path, "one of variable_horizon, disturbance_feedback", "nothing"),
+            None => door.refuse(path, METHODS, "nothing"),
             Some(Message::VariableHorizon(problem)) => {
                 asked::<VariableHorizon>(problem, path.field("variable_horizon"), door)
             }
             Some(Message::DisturbanceFeedback(problem)) => {
                 asked::<DisturbanceFeedback>(problem, path.field("disturbance_feedback"), door)
             }
-            Some(Message::AbortSafe(_)) => {
-                let served = "one of variable_horizon, disturbance_feedback";
-                door.refuse(path, served, "abort_safe, which this server does not serve yet")
+            Some(Message::AbortSafe(problem)) => {
+                asked::<AbortSafe>(problem, path.field("abort_safe"), door)
             }
         }
     }
@@ -172,6 +187,7 @@ fn wired(method: Method) -> &'static dyn AnyMethod {
     match method {
         Method::VariableHorizon => &Of::<VariableHorizon>(PhantomData),
         Method::DisturbanceFeedback => &Of::<DisturbanceFeedback>(PhantomData),
+        Method::AbortSafe => &Of::<AbortSafe>(PhantomData),
     }
 }
 
@@ -189,7 +205,7 @@ impl Problem {
         Some(match message.method.as_ref()? {
             Message::VariableHorizon(_) => VariableHorizon::PLANNING,
             Message::DisturbanceFeedback(_) => DisturbanceFeedback::PLANNING,
-            Message::AbortSafe(_) => return None,
+            Message::AbortSafe(_) => AbortSafe::PLANNING,
         })
     }
 
@@ -289,6 +305,16 @@ impl Artifact {
     /// Whether it is itself a plan, which can be kept and flown.
     pub(crate) fn is_plan(&self) -> bool {
         self.0.as_plan().is_some()
+    }
+
+    /// What safety reports are made with; `None` for other methods.
+    pub(super) fn as_abort_safe(&self) -> Option<&abort_safe::Artifact> {
+        self.0.as_abort_safe()
+    }
+
+    /// The plan that it is; `None` for what is no plan.
+    pub(super) fn as_plan(&self) -> Option<&disturbance_feedback::Plan> {
+        self.0.as_plan()
     }
 
     /// Writes a plan as a document; `None` for what is no plan.
@@ -452,6 +478,7 @@ trait AnyArtifact: fmt::Debug + Send + Sync {
         budget: Budget<'_>,
     ) -> Result<PlanVerdict, StepError>;
     fn as_plan(&self) -> Option<&disturbance_feedback::Plan>;
+    fn as_abort_safe(&self) -> Option<&abort_safe::Artifact>;
     fn render_summary(&self) -> v1::artifact::Summary;
 }
 
@@ -462,6 +489,16 @@ impl<M: Wired> Made<M> {
     fn artifact(made: M::Artifact) -> Artifact {
         Artifact(Arc::new(Self(made)))
     }
+}
+
+/// A method that does not know of failures must not ignore one.
+fn understood<M: Wired>(measured: &ElapsedAndState) -> Result<(), StepError> {
+    if M::SEES_FAILURES || measured.working.is_none() {
+        return Ok(());
+    }
+    let expected = format!("nothing: {} does not know of failures", M::METHOD.name());
+    let fault = Fault::new("working_thrusters", expected, "thrusters");
+    Err(StepError::Measurement(vec![fault]))
 }
 
 impl<M: Wired> fmt::Debug for Made<M> {
@@ -497,6 +534,7 @@ impl<M: Wired> AnyArtifact for Made<M> {
         let Some(Between(state)) = state.downcast_ref::<Between<M>>() else {
             return Err(StepError::State("it belongs to another method".to_owned()));
         };
+        understood::<M>(measured)?;
         let measurement =
             M::measurement(measured).map_err(|fault| StepError::Measurement(vec![fault]))?;
         let answer = M::step(&self.0, state, &measurement, budget)?;
@@ -508,11 +546,16 @@ impl<M: Wired> AnyArtifact for Made<M> {
         initial: Option<&ElapsedAndState>,
         budget: Budget<'_>,
     ) -> Result<PlanVerdict, StepError> {
+        initial.map_or(Ok(()), understood::<M>)?;
         M::plan(&self.0, initial, budget)
     }
 
     fn as_plan(&self) -> Option<&disturbance_feedback::Plan> {
         M::as_plan(&self.0)
+    }
+
+    fn as_abort_safe(&self) -> Option<&abort_safe::Artifact> {
+        M::as_abort_safe(&self.0)
     }
 
     fn render_summary(&self) -> v1::artifact::Summary {

@@ -1,13 +1,16 @@
 //! Real nodes on port 0, spoken to over real sockets.
 
+mod abort_safe;
 mod grpc;
 mod http;
 mod limits;
 mod malformed;
+mod malformed_abort_safe;
 mod malformed_plans;
 mod missions;
 mod operations;
 mod plans;
+mod safety_reports;
 mod steps;
 mod streams;
 mod support;
