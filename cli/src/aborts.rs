@@ -42,9 +42,8 @@ pub(crate) async fn fly(
 
 /// Runs, the report and, of a mission of one run, every step of it.
 fn write_files(report: &AbortReport, folder: &Path) -> Result<(), Failure> {
-    let cannot = |fault: std::io::Error| {
-        Failure::cannot_write(format!("{}: {fault}", folder.display()))
-    };
+    let cannot =
+        |fault: std::io::Error| Failure::cannot_write(format!("{}: {fault}", folder.display()));
     let mut written = report.write_runs(folder).map_err(cannot)?;
     if report.runs == 1 {
         written.extend(report.write_traces(folder).map_err(cannot)?);

@@ -8,7 +8,8 @@ use std::{
 use clap::{Args, ValueEnum};
 use vbar_client::v1::HorizonSearch;
 use vbar_simulator::{
-    AbortMission, AbortRunOptions, Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar, Report, RunOptions, draw,
+    AbortMission, AbortRunOptions, Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar,
+    Report, RunOptions, draw,
 };
 
 use crate::{

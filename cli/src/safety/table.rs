@@ -12,8 +12,20 @@ const WIDTH: usize = 12;
 /// One line a state, then the counts.
 pub(super) fn render(report: &SafetyReportResponse) -> String {
     let titles = [
-        "step", "phase", "x [m]", "y [m]", "z [m]", "failures", "abort", "none", "undecided",
-        "doomed", "after [s]", "drift", "enters [s]", "nearest [m]",
+        "step",
+        "phase",
+        "x [m]",
+        "y [m]",
+        "z [m]",
+        "failures",
+        "abort",
+        "none",
+        "undecided",
+        "doomed",
+        "after [s]",
+        "drift",
+        "enters [s]",
+        "nearest [m]",
     ];
     let mut text = row(titles.map(str::to_owned));
     for state in &report.states {

@@ -24,8 +24,7 @@ pub(super) fn parse(text: &str) -> Result<Given, Failure> {
     let (_, titles) = lines.next().ok_or_else(|| Failure::data("an empty trajectory"))?;
     let titles: Vec<&str> = titles.split(',').map(str::trim).collect();
     let column = |name: &str| titles.iter().position(|title| *title == name);
-    let missing: Vec<&str> =
-        COLUMNS.into_iter().filter(|name| column(name).is_none()).collect();
+    let missing: Vec<&str> = COLUMNS.into_iter().filter(|name| column(name).is_none()).collect();
     if !missing.is_empty() {
         return Err(Failure::data(format!("line 1: no column {}", missing.join(", "))));
     }
@@ -68,7 +67,8 @@ mod tests {
 
     #[test]
     fn csv_columns_are_found_by_name() {
-        let text = "k,vz_m_s,x_m,y_m,z_m,phase,vx_m_s,vy_m_s\n7,6,1,2,3,0,4,5\n8,0,0,0,0,0,0,-1e-3\n";
+        let text =
+            "k,vz_m_s,x_m,y_m,z_m,phase,vx_m_s,vy_m_s\n7,6,1,2,3,0,4,5\n8,0,0,0,0,0,0,-1e-3\n";
         let given = parse(text).unwrap();
         assert_eq!(given.first_step, 7);
         assert_eq!(given.states.states.len(), 2);
