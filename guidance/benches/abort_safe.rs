@@ -197,6 +197,7 @@ fn abort_refuted_by_branching(bencher: divan::Bencher<'_, '_>) {
         start: 0,
         horizon: 54,
         programs_max: 5000,
+        throughout: false,
     };
     bencher.bench_local(|| find_abort(&question, &x, Budget::UNLIMITED).unwrap());
 }

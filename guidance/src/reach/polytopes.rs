@@ -202,17 +202,36 @@ impl PolytopeUnion {
         x: &RelativeVector,
         count: usize,
     ) -> Vec<(f64, ReachablePolytope<'_>)> {
-        let mut near: Vec<(f64, ReachablePolytope<'_>)> = Vec::with_capacity(count + 1);
-        for set in self.sets(k) {
-            let nearness = set.nearness(x);
-            if near.len() < count || near.last().is_some_and(|last| nearness < last.0) {
-                let place = near.partition_point(|other| other.0 <= nearness);
-                near.insert(place, (nearness, set));
-                near.truncate(count);
-            }
-        }
-        near
+        nearest_of(self.sets(k), x, count)
     }
+
+    /// The same over the starts of the whole period: the union (12) taken literally.
+    #[must_use]
+    pub fn nearest_untimed(
+        &self,
+        x: &RelativeVector,
+        count: usize,
+    ) -> Vec<(f64, ReachablePolytope<'_>)> {
+        let starts = self.first..self.first + self.starts.len();
+        nearest_of(starts.flat_map(|k| self.sets(k)), x, count)
+    }
+}
+
+fn nearest_of<'a>(
+    sets: impl Iterator<Item = ReachablePolytope<'a>>,
+    x: &RelativeVector,
+    count: usize,
+) -> Vec<(f64, ReachablePolytope<'a>)> {
+    let mut near: Vec<(f64, ReachablePolytope<'a>)> = Vec::with_capacity(count + 1);
+    for set in sets {
+        let nearness = set.nearness(x);
+        if near.len() < count || near.last().is_some_and(|last| nearness < last.0) {
+            let place = near.partition_point(|other| other.0 <= nearness);
+            near.insert(place, (nearness, set));
+            near.truncate(count);
+        }
+    }
+    near
 }
 
 impl ReachablePolytope<'_> {

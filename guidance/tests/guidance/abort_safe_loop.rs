@@ -6,8 +6,9 @@ use vbar_guidance::{
     control::{
         Controller, PrepareError, StepError,
         abort_safe::{
-            AbortReason, AbortSafe, Artifact, Fallback, Measurement, Phase, Problem, Safety,
-            SetTiming, State, Step, Verdict, Watch, Weights, safety_report,
+            AbortOrigin, AbortReason, AbortSafe, Artifact, Fallback, Measurement, Phase, Problem,
+            Safety, SafetyQuestion, Separation, SetTiming, State, Step, Verdict, Watch, Weights,
+            safety_report,
         },
     },
     dynamics::{PeriodicPlant, RelativeVector},
@@ -69,6 +70,7 @@ fn station(safety_steps: usize) -> Problem {
         prediction_horizon: 30,
         clearance: 1e-4,
         timing: SetTiming::Timed,
+        separation: Separation::Tangent,
         fallback: Fallback::Soften,
         arrival: Distance::from_metres(5.0),
         fastest_approach_m_s: 5.0,
@@ -167,14 +169,15 @@ fn first_commands_on_an_eccentric_orbit_are_safe_and_certified() {
         flown.push(x);
         state = answer.next;
     }
-    let report = safety_report(&artifact, 0, 0, &flown, Budget::UNLIMITED).unwrap();
+    let question = SafetyQuestion { phase: None, first: 0, states: &flown, modes: None };
+    let report = safety_report(&artifact, &question, Budget::UNLIMITED).unwrap();
     assert_eq!(report.len(), 31);
     for verdict in &report {
         let mode = &verdict.modes[0];
         assert_eq!(mode.working, ThrustMode::NONE);
         // In free drift being outside every set and having an abort are the same.
-        assert_eq!(mode.inside_reachable_set, !matches!(mode.abort, AbortVerdict::Found(_)));
-        assert!(!mode.inside_reachable_set, "{verdict:?}");
+        assert_eq!(mode.inside_reachable_set(), !matches!(mode.abort, AbortVerdict::Found(_)));
+        assert!(!mode.inside_reachable_set(), "{verdict:?}");
     }
 }
 
@@ -253,8 +256,10 @@ fn failed_thrusters_in_a_passive_phase_mean_drift() {
     let answer = step(&artifact, &AbortSafe::start(&artifact), &measurement);
     let Verdict::Abort(command) = &answer.verdict else { panic!("{answer:?}") };
     assert_eq!(command.reason, AbortReason::Failure);
-    assert!(command.abort.forces_n.iter().all(|force| force.norm() == 0.0));
-    assert_eq!(command.abort.forces_n.len(), 212);
+    // An abort that does nothing, verified over the whole horizon.
+    assert_eq!((command.abort.throttles.len(), command.abort.horizon), (0, 212));
+    assert_eq!(command.origin, AbortOrigin::Searched);
+    assert!(command.abort.margin > 0.0 && command.abort.flight.states().len() == 213);
 }
 
 #[test]
@@ -313,13 +318,13 @@ fn every_fault_of_a_problem_is_reported() {
     let PrepareError::Faults(faults) = error else { panic!("{error:?}") };
     let fields: Vec<&str> = faults.iter().map(|fault| fault.field.as_str()).collect();
     let expected = [
-        "mass",
-        "steps_per_period",
+        "mass_kg",
+        "sample_time_s",
         "prediction_horizon",
         "clearance",
-        "phases[0].fractions",
+        "phases[0].passive.watch.fractions",
         "phases[1].weights.input",
-        "phases[2].modes",
+        "phases[2].active.modes",
     ];
     assert_eq!(fields, expected);
 }

@@ -113,6 +113,7 @@ fn question<'a>(
         start: 0,
         horizon: 54,
         programs_max: 5000,
+        throughout: false,
     }
 }
 

@@ -635,6 +635,7 @@ fn check_membership(case: &Case<'_>) {
             start: k,
             horizon,
             programs_max: 200_000,
+            throughout: false,
         };
         let verdict = find_abort(&question, &x, Budget::UNLIMITED).unwrap();
         let (exists, programs) = match &verdict {

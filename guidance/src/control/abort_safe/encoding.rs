@@ -2,7 +2,7 @@
 
 use nalgebra::SMatrix;
 
-use super::{Fallback, Phase, Problem, Safety, SetTiming, Watch, Weights};
+use super::{Fallback, Phase, Problem, Safety, Separation, SetTiming, Watch, Weights};
 use crate::{
     bytes::{DecodeError, Reader, Writer},
     mission::{AvoidanceRegion, AvoidanceSet, ThrustMode, Thruster, Thrusters},
@@ -38,6 +38,11 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
         SetTiming::Timed => 1,
         SetTiming::Untimed => 2,
     });
+    writer.tag(match problem.separation {
+        Separation::Tangent => 1,
+        Separation::LinearProgram => 2,
+        Separation::SecondOrderCone => 3,
+    });
     writer.tag(match problem.fallback {
         Fallback::Soften => 1,
         Fallback::Abort => 2,
@@ -70,6 +75,12 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         2 => SetTiming::Untimed,
         other => return Err(unknown(reader, "timing", other)),
     };
+    let separation = match reader.tag()? {
+        1 => Separation::Tangent,
+        2 => Separation::LinearProgram,
+        3 => Separation::SecondOrderCone,
+        other => return Err(unknown(reader, "separation", other)),
+    };
     let fallback = match reader.tag()? {
         1 => Fallback::Soften,
         2 => Fallback::Abort,
@@ -85,6 +96,7 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         prediction_horizon,
         clearance,
         timing,
+        separation,
         fallback,
         arrival: Distance::from_metres(reader.number()?),
         fastest_approach_m_s: reader.number()?,

@@ -30,6 +30,8 @@ pub struct Problem {
     pub clearance: f64,
     /// Which sets threaten a predicted state.
     pub timing: SetTiming,
+    /// How half-spaces that leave them out are found.
+    pub separation: Separation,
     /// What to do when no trajectory clears every half-space.
     pub fallback: Fallback,
     /// Largest distance from the target at which the last phase counts as arrived.
@@ -106,6 +108,23 @@ pub enum SetTiming {
     /// Those of every start along the orbit: (12) taken literally. Makes the paper's own start
     /// infeasible.
     Untimed,
+}
+
+/// How half-spaces that leave sets out are found.
+///
+/// A common half-space need not exist, and one that leaves the predicted state out rarely does for
+/// sets on different sides of it. Then, and in phases whose sets are of the other kind, each set
+/// gets its own tangent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Separation {
+    /// One a set: the tangent where the ray to the predicted state leaves it, which is the optimum
+    /// of the other two for a single set. [AguilarMarsillach2022, remark 5]
+    Tangent,
+    /// One for all the nearest polytopes by a linear program. [AguilarMarsillach2022, eq. 28]
+    LinearProgram,
+    /// One for all the nearest ellipsoids by a second-order cone program.
+    /// [AguilarMarsillach2022, eq. 32]
+    SecondOrderCone,
 }
 
 /// What to do when no trajectory clears every half-space.
