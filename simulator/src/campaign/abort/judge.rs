@@ -162,7 +162,7 @@ impl Judge {
 }
 
 /// The truth for as long as a flight of this case can last, drift after it included.
-fn relative_truth(
+pub(crate) fn relative_truth(
     mission: &AbortMission,
     case: &AbortCase,
     truth: AbortTruth,
