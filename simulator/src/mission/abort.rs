@@ -465,3 +465,118 @@ fn indices(
     let place = |key: &String| key.parse().ok().filter(|place| *place < length);
     changes.iter().map(|(key, change)| Some((place(key)?, change))).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::mission::abort_model::PhaseKind;
+
+    fn file(name: &str) -> Value {
+        let path = format!("{}/missions/{name}.json", env!("CARGO_MANIFEST_DIR"));
+        serde_json::from_str(&std::fs::read_to_string(path).expect(name)).expect("JSON")
+    }
+
+    fn mission(name: &str) -> AbortMission {
+        AbortMission::parse(&file(name).to_string()).expect("a mission")
+    }
+
+    fn refusal(name: &str, change: impl FnOnce(&mut Value)) -> String {
+        let mut json = file(name);
+        change(&mut json);
+        AbortMission::parse(&json.to_string()).expect_err("must be refused").to_string()
+    }
+
+    #[test]
+    fn abort_variants_change_what_they_name() {
+        let mission = mission("vbar_elliptic");
+        let kinds = |name: &str| -> Vec<PhaseKind> {
+            let case = mission.case(name).expect("a variant");
+            case.model.phases.iter().map(|phase| phase.kind).collect()
+        };
+        assert_eq!(kinds("unsafe"), [PhaseKind::Free]);
+        assert_eq!(kinds("safe"), [PhaseKind::Passive]);
+        assert_eq!(kinds("through"), [PhaseKind::Passive; 2]);
+        let safe = mission.case("safe").expect("a variant");
+        assert_eq!((safe.steps_max(), safe.published["delta_v_m_s"]), (143, 20.6));
+        assert_eq!(safe.model.phases[0].horizon_steps, 636);
+        let circular = mission.case("circular_cone").expect("a variant");
+        assert_eq!(circular.model.elements.eccentricity, 0.0);
+        assert_eq!(circular.model.phases[0].horizon_steps, 549);
+    }
+
+    #[test]
+    fn abort_failures_leave_the_thrusters_they_say() {
+        let mission = mission("active_abort");
+        let left = |name: &str| {
+            let case = mission.case(name).expect("a variant");
+            case.failure.expect("a failure").working
+        };
+        assert_eq!(left("first_fails_safe"), [1, 2, 3, 4, 5, 6, 7]);
+        assert_eq!(left("last_left_unsafe"), [7]);
+    }
+
+    #[test]
+    fn abort_changes_reach_into_objects_and_lists() {
+        let mut value = json!({"a": {"b": 1, "c": 2}, "l": [{"x": 1}, 2, 3]});
+        merge(&mut value, &json!({"a": {"b": null, "d": 4}, "l": {"0": {"y": 2}, "2": null}}));
+        assert_eq!(value, json!({"a": {"c": 2, "d": 4}, "l": [{"x": 1, "y": 2}, 2]}));
+        merge(&mut value, &json!({"l": [7], "a": 5}));
+        assert_eq!(value, json!({"a": 5, "l": [7]}));
+        // What is no index of the list replaces it.
+        merge(&mut value, &json!({"l": {"1": 0}}));
+        assert_eq!(value["l"], json!({"1": 0}));
+    }
+
+    #[test]
+    fn abort_faults_are_reported_together() {
+        let text = refusal("active_abort", |m| {
+            m["simulation"]["runs"] = 0.into();
+            m["simulation"]["drift"]["periods"] = (-1.0).into();
+            m["simulation"]["variants"][0]["failure"] =
+                json!({"when": {"at_gauge": [0.5, 2.0]}, "working": [8]});
+            m["simulation"]["variants"][1]["problem"] = json!({"abortSafe": {"wind": 1}});
+            m["simulation"]["compared"] = json!([["moon", "sun"]]);
+        });
+        for part in
+            ["simulation.runs", "periods", "thrusters 0 to 7", "at_gauge", "wind", "moon", "sun"]
+        {
+            assert!(text.contains(part), "{part} is missing in {text}");
+        }
+        let text = refusal("perturbed_55", |m| {
+            let orbit = &mut m["problem"]["abortSafe"]["orbit"];
+            orbit.as_object_mut().expect("an orbit").remove("epoch");
+            m["simulation"]["initial_state"]["ring"]["radius_m"] = json!([6000.0, 3000.0]);
+        });
+        for part in ["epoch", "radius_m"] {
+            assert!(text.contains(part), "{part} is missing in {text}");
+        }
+    }
+
+    #[test]
+    fn abort_problems_that_cannot_be_judged_are_refused() {
+        for (change, part) in [
+            (json!({"frame": "FRAME_LVLH_CCSDS"}), "frame"),
+            (json!({"massKg": -1.0}), "mass_kg"),
+            (json!({"thrusters": null}), "thrusters"),
+            (json!({"phases": []}), "phases"),
+            (json!({"orbit": {"elements": {"eccentricity": 1.0}}}), "eccentricity"),
+            (json!({"orbit": {"epoch": {"calendar": "yesterday"}}}), "epoch"),
+        ] {
+            let text = refusal("perturbed_55", |m| merge(&mut m["problem"]["abortSafe"], &change));
+            assert!(text.contains(part), "{part} is missing in {text}");
+        }
+    }
+
+    #[test]
+    fn abort_unknown_fields_and_truncated_text_are_refused() {
+        assert!(refusal("iss", |m| m["simulation"]["wind"] = 1.into()).contains("wind"));
+        let inside = refusal("iss", |m| m["simulation"]["variants"][0]["wind"] = 1.into());
+        assert!(inside.contains("wind"), "{inside}");
+        let text = file("iss").to_string();
+        for length in (0..text.len()).step_by(97) {
+            assert!(AbortMission::parse(&text[..length]).is_err(), "{length}");
+        }
+    }
+}
