@@ -64,9 +64,13 @@ pub(crate) struct HealthArguments {
 
 pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
     let mission = match arguments.mission.load()? {
+        MissionFile::AbortSafe(mission) => {
+            let name = &mission.name;
+            return Err(Failure::usage(format!("the mission {name} is flown step by step")));
+        }
         MissionFile::DisturbanceFeedback(mission) => {
             let foreign = [("--initial", arguments.initial.is_some())];
-            arguments.mission.refuse_for_plans(foreign)?;
+            arguments.mission.refuse(foreign)?;
             return plans::plan(&mission, &arguments.mission.node, &arguments.options).await;
         }
         MissionFile::VariableHorizon(mission) => arguments.mission.under_one_scheme(*mission)?,
@@ -111,7 +115,7 @@ pub(crate) async fn health(arguments: HealthArguments) -> Result<(), Failure> {
 }
 
 /// The text of a file, or of standard input for `-`.
-fn read(path: &Path) -> Result<String, Failure> {
+pub(crate) fn read(path: &Path) -> Result<String, Failure> {
     let named = |fault: io::Error| Failure::data(format!("{}: {fault}", path.display()));
     let source: Box<dyn Read> = if path == Path::new("-") {
         Box::new(io::stdin())

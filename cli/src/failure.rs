@@ -50,6 +50,11 @@ impl Failure {
         Self { code: INTERRUPTED, message: message.into() }
     }
 
+    /// The same, about a file.
+    pub(crate) fn in_file(self, path: &str) -> Self {
+        Self { message: format!("{path}: {}", self.message), ..self }
+    }
+
     /// The same, in run number `run` of a campaign.
     pub(crate) fn in_run(self, run: u32) -> Self {
         Self { message: format!("run {run}: {}", self.message), ..self }

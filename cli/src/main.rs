@@ -4,6 +4,7 @@
 //! `sysexits.h`: 64 for a wrong command line or configuration, 65 for a file that makes no sense,
 //! 69 for a node that does not answer, 70 for a fault of ours.
 
+mod aborts;
 mod calls;
 mod failure;
 mod json;
@@ -11,6 +12,7 @@ mod log;
 mod mission;
 mod plans;
 mod precompute;
+mod safety;
 mod serve;
 mod session;
 mod simulate;
@@ -51,6 +53,8 @@ enum Command {
     Step(calls::StepArguments),
     /// Make a mission's artifact on a node, show how far it is, and print its summary as JSON
     Precompute(precompute::PrecomputeArguments),
+    /// Say of a trajectory what could be done at each of its states if thrusters failed
+    Safety(safety::SafetyArguments),
     /// Ask whether a node will answer; exit code 69 if not
     Health(calls::HealthArguments),
 }
@@ -89,6 +93,7 @@ fn run(command: Command) -> Result<(), Failure> {
             Command::Upload(arguments) => plans::upload(arguments).await,
             Command::Step(arguments) => calls::step(arguments).await,
             Command::Precompute(arguments) => precompute::precompute(arguments).await,
+            Command::Safety(arguments) => safety::safety(arguments).await,
             Command::Health(arguments) => calls::health(arguments).await,
         }
     })

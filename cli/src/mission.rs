@@ -36,18 +36,16 @@ impl MissionArguments {
         }
     }
 
-    /// Names the first option that was given although it means nothing for a mission with
-    /// disturbance feedback: `--scheme` or one of `others`.
-    pub(crate) fn refuse_for_plans(
+    /// Names the first option that was given although it means nothing for this mission: `--scheme`
+    /// or one of `others`.
+    pub(crate) fn refuse(
         &self,
         others: impl IntoIterator<Item = (&'static str, bool)>,
     ) -> Result<(), Failure> {
         let scheme = ("--scheme", self.scheme.is_some());
         match std::iter::once(scheme).chain(others).find(|(_, given)| *given) {
             None => Ok(()),
-            Some((name, _)) => Err(Failure::usage(format!(
-                "{name} is not for a mission with disturbance feedback"
-            ))),
+            Some((name, _)) => Err(Failure::usage(format!("{name} is not for this mission"))),
         }
     }
 }

@@ -8,10 +8,12 @@ use std::{
 use clap::{Args, ValueEnum};
 use vbar_client::v1::HorizonSearch;
 use vbar_simulator::{
-    Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar, Report, RunOptions, draw,
+    AbortMission, AbortRunOptions, Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar,
+    Report, RunOptions, draw,
 };
 
 use crate::{
+    aborts,
     failure::Failure,
     json,
     mission::MissionArguments,
@@ -69,6 +71,18 @@ pub(crate) struct SimulateArguments {
     changes: ChangeArguments,
 }
 
+impl SimulateArguments {
+    /// Options of closed loops with a variable horizon alone, and whether they were given.
+    fn horizon_options(&self) -> [(&'static str, bool); 4] {
+        [
+            ("--search", self.search.is_some()),
+            ("--misalignment-deg", self.misalignment_deg.is_some()),
+            ("--compare-search", self.compare_search),
+            ("--fuel-weights", !self.fuel_weights.is_empty()),
+        ]
+    }
+}
+
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Search {
     /// From a guess to the nearest feasible horizon, then downhill
@@ -88,6 +102,7 @@ pub(crate) enum Format {
 /// Flies a mission and reports.
 pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure> {
     let mission = match arguments.mission.load()? {
+        MissionFile::AbortSafe(mission) => return fly_aborts(&mission, arguments).await,
         MissionFile::DisturbanceFeedback(mission) => return fly_plans(&mission, arguments).await,
         MissionFile::VariableHorizon(mission) => *mission,
     };
@@ -111,15 +126,29 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
     Ok(())
 }
 
+/// Flies a mission under abort-safe control.
+async fn fly_aborts(mission: &AbortMission, arguments: SimulateArguments) -> Result<(), Failure> {
+    if let Some(name) = arguments.changes.given() {
+        return Err(Failure::usage(format!("{name} is not for this mission")));
+    }
+    arguments.mission.refuse(arguments.horizon_options())?;
+    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
+    let options = aborts::FlightOptions {
+        run: AbortRunOptions {
+            runs: arguments.runs,
+            seed: arguments.seed,
+            concurrency: arguments.concurrency,
+            variant: arguments.variant,
+        },
+        format: arguments.format,
+        out: (!arguments.no_pictures).then_some(folder),
+    };
+    aborts::fly(mission, &arguments.mission.node, options).await
+}
+
 /// Flies the plans of a mission with disturbance feedback.
 async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Result<(), Failure> {
-    let foreign = [
-        ("--search", arguments.search.is_some()),
-        ("--misalignment-deg", arguments.misalignment_deg.is_some()),
-        ("--compare-search", arguments.compare_search),
-        ("--fuel-weights", !arguments.fuel_weights.is_empty()),
-    ];
-    arguments.mission.refuse_for_plans(foreign)?;
+    arguments.mission.refuse(arguments.horizon_options())?;
     let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
     let options = FlightOptions {
         run: PlanRunOptions {

@@ -6,10 +6,12 @@
 //!
 //! A mission file ([`MissionFile`]) says what the service is asked and against which truth it is
 //! flown. Closed loops ([`Mission`]) are flown by [`simulate`], plans ([`PlanMission`]) by
-//! [`fly_plans`], many runs at once; the [`Report`] or [`PlanReport`] holds every trace, the
-//! statistics and the published figures; [`draw`] and [`draw_plans`] make pictures of it.
+//! [`fly_plans`], loops that can be aborted ([`AbortMission`]) by [`fly_aborts`], many runs at once;
+//! the [`Report`], [`PlanReport`] or [`AbortReport`] holds every trace, the statistics and the
+//! published figures; [`draw`], [`draw_plans`] and [`draw_aborts`] make pictures of it.
 
 mod campaign;
+mod clearance;
 mod mission;
 mod pictures;
 mod plant;
@@ -18,6 +20,10 @@ mod report;
 pub use campaign::{
     Campaign, Flight, Progress, ProgressBar, RunOptions, SchemeChoice, Silent, SimulationError,
     SweepPoint,
+    abort::{
+        AbortCampaign, AbortFlight, AbortOutcome, AbortRunOptions, AbortSample, AbortStep, Drift,
+        FlownFailure, ModeCounts, Origin, UnsafeSets, fly_aborts,
+    },
     flight::{Outcome, Sample, Step, VIOLATION_TOLERANCE_ND},
     plan::{
         FlownBurn, OpenLoopEnd, PlanAnswer, PlanCampaign, PlanFlight, PlanRow, PlanRunOptions,
@@ -27,12 +33,15 @@ pub use campaign::{
     simulate,
 };
 pub use mission::{
-    Mission, MissionError, MissionFile, PlanChanges, PlanMission, Published, PublishedAxes,
-    RUNS_MAX, metric_name, metric_named,
+    AbortCase, AbortMission, AbortSources, Mission, MissionError, MissionFile, PlanChanges,
+    PlanMission, Published, PublishedAxes, RUNS_MAX, metric_name, metric_named,
 };
-pub use pictures::{PictureError, draw, plan::draw_plans};
+pub use pictures::{PictureError, abort::draw_aborts, draw, plan::draw_plans};
 pub use report::{
     Report, Statistics, Summary,
+    abort::{
+        AbortReport, AbortSummary, DriftFigures, FailureFigures, PathComparison, PhaseFigures,
+    },
     plan::{PlanReport, PlanSummary, plan_rows_json, plan_rows_text, plan_text},
 };
 
@@ -44,6 +53,14 @@ mod tests {
     pub(crate) fn golden_cases(file: &str) -> Vec<serde_json::Value> {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/variable_horizon");
         let path = format!("{folder}/{file}");
+        let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
+        serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
+    }
+
+    /// One case of abort safety (see `tests/golden/abort_safe`).
+    pub(crate) fn abort_case(name: &str) -> serde_json::Value {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/abort_safe");
+        let path = format!("{folder}/{name}.json");
         let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
         serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
     }

@@ -3,9 +3,11 @@
 //!
 //! Top level: `name`, `description` (where the numbers come from, and what the paper leaves open),
 //! `problem` (canonical JSON of `vbar.v1.Problem`), `simulation`, `published`. The last two mean
-//! what the problem's method needs: see [`Mission`] and [`PlanMission`]. Unknown fields are refused
+//! what the problem's method needs: see [`AbortMission`], [`Mission`] and [`PlanMission`]. Unknown fields are refused
 //! everywhere.
 
+pub(crate) mod abort;
+pub(crate) mod abort_model;
 pub(crate) mod law;
 pub(crate) mod model;
 pub(crate) mod plan;
@@ -21,6 +23,7 @@ use vbar_proto::{
     v1::{self, VariableHorizonScheme as Scheme},
 };
 
+pub use abort::{AbortCase, AbortMission, AbortSources};
 use law::{DisturbanceLaw, InitialLaw, Randomisation, TruthLaw};
 use model::Model;
 pub use plan::{PlanChanges, PlanMission, PublishedAxes, metric_name, metric_named};
@@ -34,6 +37,8 @@ pub const RUNS_MAX: u32 = 100_000;
 /// A mission of whichever method its problem names.
 #[derive(Debug, Clone)]
 pub enum MissionFile {
+    /// Closed loops that can be aborted at every step.
+    AbortSafe(Box<AbortMission>),
     /// Closed loops under variable-horizon control.
     VariableHorizon(Box<Mission>),
     /// Fixed-time plans with disturbance feedback.
@@ -61,8 +66,11 @@ impl MissionFile {
             problem: BTreeMap<String, serde::de::IgnoredAny>,
         }
         let head: Head = serde_json::from_str(text)?;
-        let arms = ["disturbanceFeedback", "disturbance_feedback"];
-        if arms.iter().any(|arm| head.problem.contains_key(*arm)) {
+        let asks = |arms: [&str; 2]| arms.iter().any(|arm| head.problem.contains_key(*arm));
+        if asks(["abortSafe", "abort_safe"]) {
+            return AbortMission::parse(text).map(|mission| Self::AbortSafe(mission.into()));
+        }
+        if asks(["disturbanceFeedback", "disturbance_feedback"]) {
             return PlanMission::parse(text)
                 .map(|mission| Self::DisturbanceFeedback(mission.into()));
         }
@@ -73,6 +81,7 @@ impl MissionFile {
     #[must_use]
     pub fn name(&self) -> &str {
         match self {
+            Self::AbortSafe(mission) => &mission.name,
             Self::VariableHorizon(mission) => &mission.name,
             Self::DisturbanceFeedback(mission) => &mission.name,
         }
@@ -82,6 +91,7 @@ impl MissionFile {
     #[must_use]
     pub fn into_problem(self) -> v1::Problem {
         match self {
+            Self::AbortSafe(mission) => mission.problem,
             Self::VariableHorizon(mission) => mission.problem,
             Self::DisturbanceFeedback(mission) => mission.problem,
         }
@@ -397,13 +407,17 @@ mod tests {
         }
         names.sort();
         let expected = [
+            "active_abort",
             "double_integrator",
             "envisat",
             "gto",
+            "iss",
             "leo_tumbler",
+            "perturbed_55",
             "prisma",
             "simbol_x",
             "tumbling_satellite",
+            "vbar_elliptic",
         ];
         assert_eq!(names, expected);
     }
