@@ -20,9 +20,9 @@ use vbar_proto::{
         Artifact, ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
         GetArtifactRequest, GetPlanRequest, GetPlanResponse, GetServerInfoRequest,
         GetServerInfoResponse, ListPlansRequest, ListPlansResponse, PrecomputeRequest,
-        PrecomputeResponse, Problem, SafetyReportRequest, SafetyReportResponse, StepRequest, StepResponse, UploadPlanRequest,
-        UploadPlanResponse, guidance_service_client::GuidanceServiceClient,
-        step_stream_request::Controller,
+        PrecomputeResponse, Problem, SafetyReportRequest, SafetyReportResponse, StepRequest,
+        StepResponse, UploadPlanRequest, UploadPlanResponse,
+        guidance_service_client::GuidanceServiceClient, step_stream_request::Controller,
     },
 };
 

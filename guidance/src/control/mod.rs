@@ -1,6 +1,7 @@
 //! The methods: one folder each, one trait, one list.
 
 pub mod abort_safe;
+mod canonical;
 pub mod disturbance_feedback;
 pub mod offline_sampling;
 pub mod variable_horizon;

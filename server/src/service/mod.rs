@@ -29,8 +29,8 @@ use crate::{
         DecidedStep, Document, ElapsedAndState, ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer,
         KeptPlanCall, Limits, OperationAnswer, OperationName, OperationsAnswer, OperationsCall,
         PlanAnswer, PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, PrecomputeCall,
-        Problem, Provenance, ReportAnswer, ReportCall, SolverWork, State, StateFault, StepAnswer, StepCall, UploadAnswer,
-        UploadCall, VerdictKind,
+        Problem, Provenance, ReportAnswer, ReportCall, SolverWork, State, StateFault, StepAnswer,
+        StepCall, UploadAnswer, UploadCall, VerdictKind,
     },
 };
 use cache::{Cache, Outcome};

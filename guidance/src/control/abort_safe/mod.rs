@@ -55,12 +55,16 @@ mod safety;
 mod state;
 mod step;
 mod summary;
+mod unsafe_state;
 
 pub use answer::{
     AbortCommand, AbortOrigin, AbortReason, Arrival, Command, Diagnostics, Measurement,
-    ModeVerdict, StateVerdict, Step, Trajectory, Verdict,
+    ModeVerdict, StateVerdict, Step, Trajectory, UnsafeState, Verdict,
 };
 pub use artifact::{Artifact, Shard};
+pub use faults::{
+    FRACTIONS_MAX, INSTANTS_MAX, NEAREST_MAX, NUMBERS_MAX, PREDICTION_MAX, STEPS_MAX,
+};
 pub use problem::{Fallback, Phase, Problem, Safety, Separation, SetTiming, Watch, Weights};
 pub use safety::{SafetyQuestion, safety_report};
 pub use state::State;

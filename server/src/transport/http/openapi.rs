@@ -34,12 +34,7 @@ const ROUTES: [Route; 15] = [
     bare("get", EXPORT, "vbar.v1.GuidanceService.ExportPlan"),
     route("post", "/v1/precompute", "vbar.v1.GuidanceService.Precompute", Body::Required),
     route("post", "/v1/step", "vbar.v1.GuidanceService.Step", Body::Required),
-    route(
-        "post",
-        "/v1/safety:report",
-        "vbar.v1.GuidanceService.SafetyReport",
-        Body::Required,
-    ),
+    route("post", "/v1/safety:report", "vbar.v1.GuidanceService.SafetyReport", Body::Required),
     bare("get", "/v1/info", "vbar.v1.GuidanceService.GetServerInfo"),
     bare("get", "/v1/artifacts/{id}", "vbar.v1.GuidanceService.GetArtifact"),
     bare("get", "/v1/operations", "google.longrunning.Operations.ListOperations"),
