@@ -3,13 +3,16 @@
 //!
 //! Top level: `name`, `description` (where the numbers come from, and what the paper leaves open),
 //! `problem` (canonical JSON of `vbar.v1.Problem`), `simulation`, `published`. The last two mean
-//! what the problem's method needs: see [`Mission`] and [`PlanMission`]. Unknown fields are refused
+//! what the problem's method needs: see [`Mission`], [`PlanMission`] and [`SamplingMission`]. Unknown fields are refused
 //! everywhere.
 
 pub(crate) mod law;
 pub(crate) mod model;
 pub(crate) mod plan;
 pub(crate) mod plan_model;
+pub(crate) mod sampling;
+pub(crate) mod sampling_law;
+pub(crate) mod sampling_model;
 mod start;
 
 use std::{collections::BTreeMap, fs, path::Path};
@@ -24,6 +27,9 @@ use vbar_proto::{
 use law::{DisturbanceLaw, InitialLaw, Randomisation, TruthLaw};
 use model::Model;
 pub use plan::{PlanChanges, PlanMission, PublishedAxes, metric_name, metric_named};
+pub use sampling::{
+    PublishedEffort, SamplingMission, sampling_scheme_name, sampling_scheme_named,
+};
 
 /// Largest mission file that is read.
 const FILE_BYTES_MAX: u64 = 16 << 20;
@@ -38,6 +44,8 @@ pub enum MissionFile {
     VariableHorizon(Box<Mission>),
     /// Fixed-time plans with disturbance feedback.
     DisturbanceFeedback(Box<PlanMission>),
+    /// Closed loops under sampled chance constraints.
+    OfflineSampling(Box<SamplingMission>),
 }
 
 impl MissionFile {
@@ -61,10 +69,14 @@ impl MissionFile {
             problem: BTreeMap<String, serde::de::IgnoredAny>,
         }
         let head: Head = serde_json::from_str(text)?;
-        let arms = ["disturbanceFeedback", "disturbance_feedback"];
-        if arms.iter().any(|arm| head.problem.contains_key(*arm)) {
+        let asks = |arms: [&str; 2]| arms.iter().any(|arm| head.problem.contains_key(*arm));
+        if asks(["disturbanceFeedback", "disturbance_feedback"]) {
             return PlanMission::parse(text)
                 .map(|mission| Self::DisturbanceFeedback(mission.into()));
+        }
+        if asks(["offlineSampling", "offline_sampling"]) {
+            return SamplingMission::parse(text)
+                .map(|mission| Self::OfflineSampling(mission.into()));
         }
         Mission::parse(text).map(|mission| Self::VariableHorizon(mission.into()))
     }
@@ -75,6 +87,7 @@ impl MissionFile {
         match self {
             Self::VariableHorizon(mission) => &mission.name,
             Self::DisturbanceFeedback(mission) => &mission.name,
+            Self::OfflineSampling(mission) => &mission.name,
         }
     }
 
@@ -84,6 +97,7 @@ impl MissionFile {
         match self {
             Self::VariableHorizon(mission) => mission.problem,
             Self::DisturbanceFeedback(mission) => mission.problem,
+            Self::OfflineSampling(mission) => mission.problem,
         }
     }
 }
@@ -400,7 +414,9 @@ mod tests {
             "double_integrator",
             "envisat",
             "gto",
+            "hcw_docking",
             "leo_tumbler",
+            "poseidyn",
             "prisma",
             "simbol_x",
             "tumbling_satellite",

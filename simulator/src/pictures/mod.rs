@@ -6,7 +6,9 @@
 mod chart;
 pub(crate) mod plan;
 mod plane;
+mod region;
 mod rendezvous;
+pub(crate) mod sampling;
 mod series;
 
 use std::{

@@ -7,7 +7,9 @@ pub(crate) mod cone;
 pub(crate) mod hill;
 pub(crate) mod linear;
 pub(crate) mod lvlh;
+pub(crate) mod planar;
 pub(crate) mod rotation;
+pub(crate) mod thrusters;
 pub(crate) mod two_body;
 
 /// Earth's gravitational parameter, m^3/s^2 (WGS 84).

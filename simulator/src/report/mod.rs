@@ -1,6 +1,7 @@
 //! What a campaign showed: numbers for programs, a table for people, traces for other tools.
 
 pub(crate) mod plan;
+pub(crate) mod sampling;
 mod statistics;
 mod table;
 
