@@ -201,7 +201,8 @@ impl SamplingMission {
         if let Some(inner) = offline_sampling_mut(&mut problem) {
             inner.set_scheme(scheme);
             if scheme != Scheme::OfflineSampling {
-                (inner.samples, inner.redundancy, inner.first_step) = (None, None, None);
+                (inner.samples, inner.redundancy) = (None, None);
+                (inner.first_step, inner.seed) = (None, None);
             }
         }
         problem
