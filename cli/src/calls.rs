@@ -73,8 +73,12 @@ pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
     let mission = match arguments.mission.load()? {
         MissionFile::DisturbanceFeedback(mission) => {
             let foreign = [("--initial", arguments.initial.is_some())];
-            arguments.mission.refuse_for_plans(foreign)?;
+            arguments.mission.refuse(foreign)?;
             return plans::plan(&mission, &arguments.mission.node, &arguments.options).await;
+        }
+        MissionFile::OfflineSampling(mission) => {
+            let name = &mission.name;
+            return Err(Failure::usage(format!("the mission {name} is flown step by step")));
         }
         MissionFile::VariableHorizon(mission) => arguments.mission.under_one_scheme(*mission)?,
     };
@@ -109,9 +113,10 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
 pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
     let problem = match arguments.mission.load()? {
         MissionFile::DisturbanceFeedback(mission) => {
-            arguments.mission.refuse_for_plans([])?;
+            arguments.mission.refuse([])?;
             mission.problem
         }
+        MissionFile::OfflineSampling(mission) => arguments.mission.sampling_problem(&mission)?,
         MissionFile::VariableHorizon(mission) => {
             arguments.mission.under_one_scheme(*mission)?.problem
         }

@@ -10,6 +10,7 @@ mod json;
 mod log;
 mod mission;
 mod plans;
+mod sampling;
 mod serve;
 mod session;
 mod simulate;

@@ -8,7 +8,8 @@ use std::{
 use clap::{Args, ValueEnum};
 use vbar_client::v1::HorizonSearch;
 use vbar_simulator::{
-    Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar, Report, RunOptions, draw,
+    Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar, Report, RunOptions,
+    SamplingMission, SamplingRunOptions, draw,
 };
 
 use crate::{
@@ -16,6 +17,7 @@ use crate::{
     json,
     mission::MissionArguments,
     plans::{self, ChangeArguments, FlightOptions},
+    sampling,
     session::Session,
 };
 
@@ -28,7 +30,7 @@ pub(crate) struct SimulateArguments {
     /// How the horizon is searched instead of the mission's own way
     #[arg(long, value_name = "SEARCH")]
     search: Option<Search>,
-    /// Number of runs [default: the mission's]
+    /// Number of runs, from each start where a mission names several [default: the mission's]
     #[arg(long, value_name = "N")]
     runs: Option<u32>,
     /// Start of every stream of chance: the same seed flies the same runs
@@ -89,6 +91,7 @@ pub(crate) enum Format {
 pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure> {
     let mission = match arguments.mission.load()? {
         MissionFile::DisturbanceFeedback(mission) => return fly_plans(&mission, arguments).await,
+        MissionFile::OfflineSampling(mission) => return fly_sampling(&mission, arguments).await,
         MissionFile::VariableHorizon(mission) => *mission,
     };
     if let Some(name) = arguments.changes.given() {
@@ -113,13 +116,7 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
 
 /// Flies the plans of a mission with disturbance feedback.
 async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Result<(), Failure> {
-    let foreign = [
-        ("--search", arguments.search.is_some()),
-        ("--misalignment-deg", arguments.misalignment_deg.is_some()),
-        ("--compare-search", arguments.compare_search),
-        ("--fuel-weights", !arguments.fuel_weights.is_empty()),
-    ];
-    arguments.mission.refuse_for_plans(foreign)?;
+    arguments.mission.refuse(arguments.of_one_method())?;
     let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
     let options = FlightOptions {
         run: PlanRunOptions {
@@ -136,6 +133,43 @@ async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Resul
     plans::fly(mission, &arguments.mission.node, options.changed(&arguments.changes)).await
 }
 
+/// Flies a mission under sampled chance constraints.
+async fn fly_sampling(
+    mission: &SamplingMission,
+    arguments: SimulateArguments,
+) -> Result<(), Failure> {
+    let scheme = arguments.mission.scheme()?;
+    let foreign = arguments.of_one_method().into_iter().find(|(_, given)| *given);
+    if let Some(name) = foreign.map(|(name, _)| name).or(arguments.changes.given()) {
+        return Err(Failure::usage(format!("{name} is not for this mission")));
+    }
+    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
+    let options = sampling::FlightOptions {
+        run: SamplingRunOptions {
+            scheme,
+            repetitions: arguments.runs,
+            seed: arguments.seed,
+            concurrency: arguments.concurrency,
+            variant: arguments.variant,
+        },
+        format: arguments.format,
+        out: (!arguments.no_pictures).then_some(folder),
+    };
+    sampling::fly(mission, &arguments.mission.node, options).await
+}
+
+impl SimulateArguments {
+    /// Options that only variable-horizon missions have, and whether they were given.
+    fn of_one_method(&self) -> [(&'static str, bool); 4] {
+        [
+            ("--search", self.search.is_some()),
+            ("--misalignment-deg", self.misalignment_deg.is_some()),
+            ("--compare-search", self.compare_search),
+            ("--fuel-weights", !self.fuel_weights.is_empty()),
+        ]
+    }
+}
+
 fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
     let misalignment_deg = match arguments.misalignment_deg.as_deref() {
         None => None,
@@ -146,7 +180,7 @@ fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
         }
     };
     Ok(RunOptions {
-        scheme: arguments.mission.scheme,
+        scheme: arguments.mission.scheme()?,
         search: arguments.search.map(|search| match search {
             Search::Local => HorizonSearch::Local,
             Search::Enumeration => HorizonSearch::Enumeration,
@@ -165,11 +199,16 @@ fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
 fn tell_pictures(mission: &Mission, report: &Report, folder: &Path) -> Result<(), Failure> {
     let drawn = draw(mission, report, folder)
         .map_err(|fault| Failure::cannot_write(format!("{}: {fault}", folder.display())))?;
-    eprintln!("{} files in {}:", drawn.len(), folder.display());
-    for path in drawn {
+    tell(&drawn, folder);
+    Ok(())
+}
+
+/// Names what was written.
+pub(crate) fn tell(written: &[PathBuf], folder: &Path) {
+    eprintln!("{} files in {}:", written.len(), folder.display());
+    for path in written {
         eprintln!("  {}", path.display());
     }
-    Ok(())
 }
 
 pub(crate) fn failure(error: vbar_simulator::SimulationError) -> Failure {
