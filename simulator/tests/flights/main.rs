@@ -5,6 +5,7 @@
 
 mod closed_loops;
 mod plans;
+mod sampling;
 
 use vbar_client::Client;
 use vbar_server::{Config, Node};
