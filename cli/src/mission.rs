@@ -49,7 +49,9 @@ impl MissionArguments {
         match self.scheme()? {
             None => Ok(mission.problem.clone()),
             Some(SamplingSchemeChoice::All) => Err(one_is_needed()),
-            Some(SamplingSchemeChoice::One(scheme)) => Ok(mission.problem_under(scheme)),
+            Some(SamplingSchemeChoice::One(scheme)) => {
+                mission.problem_under(scheme).map_err(|fault| Failure::data(fault.to_string()))
+            }
         }
     }
 

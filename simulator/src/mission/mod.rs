@@ -27,9 +27,7 @@ use vbar_proto::{
 use law::{DisturbanceLaw, InitialLaw, Randomisation, TruthLaw};
 use model::Model;
 pub use plan::{PlanChanges, PlanMission, PublishedAxes, metric_name, metric_named};
-pub use sampling::{
-    PublishedEffort, SamplingMission, sampling_scheme_name, sampling_scheme_named,
-};
+pub use sampling::{PublishedEffort, SamplingMission, sampling_scheme_name, sampling_scheme_named};
 
 /// Largest mission file that is read.
 const FILE_BYTES_MAX: u64 = 16 << 20;

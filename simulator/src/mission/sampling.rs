@@ -3,7 +3,8 @@
 //! `simulation`: `repetitions` of each of the `starts` against the `truth`, whose `disturbance` is
 //! added to the state after each sample, until the chaser is within `docking`. Starts are given
 //! relative to some origin and become states relative to `target_m`, the origin of the problem.
-//! `variants` are JSON merge patches (RFC 7396) of `problem` and `simulation`.
+//! `compared_schemes` and `variants` are JSON merge patches (RFC 7396), of the problem's method and
+//! of `problem` and `simulation`.
 
 use std::{collections::BTreeMap, path::Path};
 
@@ -11,8 +12,7 @@ use nalgebra::DVector;
 use serde::Deserialize;
 use serde_json::Value;
 use vbar_proto::v1::{
-    self, NoFirstStepSet, OfflineSamplingScheme as Scheme,
-    offline_sampling_problem::FirstStep,
+    self, NoFirstStepSet, OfflineSamplingScheme as Scheme, offline_sampling_problem::FirstStep,
 };
 
 use super::{
@@ -70,9 +70,9 @@ pub(crate) struct SamplingSimulation {
     pub thrusters: ThrusterLaw,
     /// When a flight ends.
     pub docking: Docking,
-    /// Controllers flown beside the problem's own.
+    /// Controllers flown beside the problem's own, each with a merge patch of the problem's method.
     #[serde(default)]
-    pub compared_schemes: Vec<String>,
+    pub compared_schemes: BTreeMap<String, Value>,
     /// A second loop that holds the chaser's attitude.
     pub attitude: Option<AttitudeLaw>,
     /// Merge patches of this file.
@@ -190,14 +190,27 @@ impl SamplingMission {
     pub fn compared_schemes(&self) -> Vec<Scheme> {
         let own = self.scheme();
         let named = self.simulation.compared_schemes.iter();
-        let others = named.filter_map(|name| sampling_scheme_named(name)).filter(|s| *s != own);
+        let others = named.filter_map(|(name, _)| sampling_scheme_named(name));
+        let others = others.filter(|scheme| *scheme != own);
         std::iter::once(own).chain(others).collect()
     }
 
-    /// The problem under another controller; what only the sampled one has is left out for others.
-    #[must_use]
-    pub fn problem_under(&self, scheme: Scheme) -> v1::Problem {
-        let mut problem = self.problem.clone();
+    /// The problem under another controller, changed as the mission says; what only the sampled
+    /// one has is left out for others.
+    ///
+    /// # Errors
+    /// When the changed problem is not one of the contract's.
+    pub fn problem_under(&self, scheme: Scheme) -> Result<v1::Problem, MissionError> {
+        if scheme == self.scheme() {
+            return Ok(self.problem.clone());
+        }
+        let mut source = self.source["problem"].clone();
+        let name = sampling_scheme_name(scheme);
+        let patch = self.simulation.compared_schemes.get(name);
+        for arm in source.as_object_mut().into_iter().flat_map(|arms| arms.values_mut()) {
+            merge(arm, patch.unwrap_or(&Value::Object(serde_json::Map::new())));
+        }
+        let mut problem = parse_problem(source)?;
         if let Some(inner) = offline_sampling_mut(&mut problem) {
             inner.set_scheme(scheme);
             if scheme != Scheme::OfflineSampling {
@@ -205,7 +218,7 @@ impl SamplingMission {
                 (inner.first_step, inner.seed) = (None, None);
             }
         }
-        problem
+        Ok(problem)
     }
 
     /// The same mission, its problem as the simulator understands it.
@@ -219,8 +232,16 @@ impl SamplingMission {
         check_name(&self.name, &mut faults);
         check_runs("simulation.repetitions", simulation.repetitions, &mut faults);
         let compared = &simulation.compared_schemes;
-        for name in compared.iter().filter(|name| sampling_scheme_named(name).is_none()) {
-            faults.push(format!("simulation.compared_schemes: no scheme is called {name}"));
+        for name in compared.keys() {
+            let place = format!("simulation.compared_schemes.{name}");
+            match sampling_scheme_named(name).map(|scheme| self.problem_under(scheme)) {
+                None => faults.push(format!("{place}: no scheme is called so")),
+                Some(Err(fault)) => faults.push(format!("{place}: {fault}")),
+                Some(Ok(problem)) => {
+                    let inner = SamplingModel::new(&problem).err().unwrap_or_default();
+                    faults.extend(inner.into_iter().map(|fault| format!("{place}: {fault}")));
+                }
+            }
         }
         for (name, patch) in &simulation.variants {
             let parts = patch.as_object().map(|object| object.keys().cloned().collect());
@@ -396,11 +417,17 @@ mod tests {
         let mission = SamplingMission::parse(&poseidyn().to_string()).expect("a mission");
         let schemes = [Scheme::OfflineSampling, Scheme::LinearQuadratic, Scheme::TubeRobust];
         assert_eq!(mission.compared_schemes(), schemes);
-        let robust = mission.problem_under(Scheme::TubeRobust);
+        let robust = mission.problem_under(Scheme::TubeRobust).expect("a problem");
         let robust = offline_sampling(&robust).expect("the arm");
         assert!(robust.samples.is_none() && robust.redundancy.is_none());
-        assert!(robust.first_step.is_none());
+        assert!(robust.first_step.is_none() && robust.seed.is_none());
         assert!(robust.state_set.is_some());
+        // As the mission's patch says, and only there.
+        let offsets = |problem: &v1::OfflineSamplingProblem| {
+            problem.input_set.as_ref().expect("a set").offsets.clone()
+        };
+        assert_eq!(offsets(robust), [0.1; 4]);
+        assert_eq!(offsets(offline_sampling(&mission.problem).expect("the arm")), [0.3; 4]);
     }
 
     #[test]
@@ -422,7 +449,7 @@ mod tests {
         let text = refusal(|m| {
             let simulation = &mut m["simulation"];
             simulation["repetitions"] = 0.into();
-            simulation["compared_schemes"] = json!(["FANCY"]);
+            simulation["compared_schemes"] = json!({"FANCY": {}});
             simulation["starts"][0]["position_m"] = json!([1.0]);
             simulation["starts"][1]["name"] = "C".into();
             simulation["target_m"] = json!([1.0, 2.0, 3.0]);
@@ -432,8 +459,15 @@ mod tests {
             simulation["truth"]["planar"]["mass_kg"] = 0.0.into();
         });
         for part in [
-            "repetitions", "FANCY", "starts.A", "C is named twice", "target_m", "disturbance",
-            "force_max_n", "distance_m", "mass_kg",
+            "repetitions",
+            "FANCY",
+            "starts.A",
+            "C is named twice",
+            "target_m",
+            "disturbance",
+            "force_max_n",
+            "distance_m",
+            "mass_kg",
         ] {
             assert!(text.contains(part), "{part} is missing in {text}");
         }

@@ -141,7 +141,11 @@ impl SamplingTruth {
             }
             Self::Hill(law) => {
                 let place = format!("{place}.hill");
-                check_positive(&format!("{place}.mean_motion_deg_s"), &law.mean_motion_deg_s, faults);
+                check_positive(
+                    &format!("{place}.mean_motion_deg_s"),
+                    &law.mean_motion_deg_s,
+                    faults,
+                );
                 check_positive(&format!("{place}.mass_kg"), &law.mass_kg, faults);
             }
             Self::TwoBody(law) => {
@@ -218,12 +222,7 @@ impl AttitudeLaw {
         parse_problem(self.problem.clone())
     }
 
-    pub(crate) fn check(
-        &self,
-        place: &str,
-        translation: &SamplingModel,
-        faults: &mut Vec<String>,
-    ) {
+    pub(crate) fn check(&self, place: &str, translation: &SamplingModel, faults: &mut Vec<String>) {
         match self.problem().map(|problem| SamplingModel::new(&problem)) {
             Err(fault) => faults.push(format!("{place}.problem: {fault}")),
             Ok(Err(inner)) => {
@@ -275,7 +274,11 @@ mod tests {
         let cases = [
             (NoiseLaw::Uniform { bound: 0.3 }, 0.3 / 3.0_f64.sqrt(), 0.3),
             (NoiseLaw::TruncatedGaussian { deviation: 1.0, bound: 1.0 }, 0.539_560, 1.0),
-            (NoiseLaw::TruncatedGaussian { deviation: 1.0, bound: 5e-3 }, 5e-3 / 3.0_f64.sqrt(), 5e-3),
+            (
+                NoiseLaw::TruncatedGaussian { deviation: 1.0, bound: 5e-3 },
+                5e-3 / 3.0_f64.sqrt(),
+                5e-3,
+            ),
         ];
         let mut chance = ChaCha12Rng::seed_from_u64(3);
         let count = 40_000;

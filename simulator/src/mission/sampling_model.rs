@@ -66,7 +66,8 @@ impl SamplingModel {
         }
         let cone = inner.cone.as_ref().and_then(|given| Cone::read(given, &mut faults));
         let place = format!("{HERE}.state_set");
-        let given = inner.state_set.as_ref().map(|set| half_spaces(&place, set, states, &mut faults));
+        let given =
+            inner.state_set.as_ref().map(|set| half_spaces(&place, set, states, &mut faults));
         let mut state_set = given.unwrap_or_else(|| HalfSpaces {
             normals: DMatrix::zeros(0, states),
             offsets: DVector::zeros(0),

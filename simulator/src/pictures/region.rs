@@ -15,7 +15,8 @@ const FAR: f64 = 1e6;
 /// found by trying every four rows. `None` for sets of too many rows.
 pub(super) fn shadow(set: &HalfSpaces) -> Option<Points> {
     let rows = set.offsets.len();
-    let choices = (0..4).fold(1, |product: usize, i| product.saturating_mul(rows.saturating_sub(i)));
+    let choices =
+        (0..4).fold(1, |product: usize, i| product.saturating_mul(rows.saturating_sub(i)));
     if set.normals.ncols() != 4 || choices / 24 > CHOICES_MAX {
         return None;
     }
@@ -84,7 +85,8 @@ fn hull(mut points: Points) -> Points {
     let chain = |points: &mut dyn Iterator<Item = (f64, f64)>| {
         let mut chain = Points::new();
         for point in points {
-            while chain.len() >= 2 && turn(chain[chain.len() - 2], chain[chain.len() - 1], point) <= 0.0
+            while chain.len() >= 2
+                && turn(chain[chain.len() - 2], chain[chain.len() - 1], point) <= 0.0
             {
                 chain.pop();
             }

@@ -20,8 +20,9 @@ use super::{
 use crate::{
     campaign::sampling::{SamplingCampaign, SamplingFlight},
     mission::{
-        SamplingMission, sampling_scheme_name,
+        SamplingMission,
         sampling_model::{SamplingModel, half_spaces},
+        sampling_scheme_name,
     },
     report::sampling::SamplingReport,
 };
@@ -95,7 +96,11 @@ impl Scene<'_> {
     }
 
     /// One entry a start, then `others`.
-    fn legend(&self, mark: Mark, others: &[(&str, Mark, RGBColor)]) -> Vec<(String, Mark, RGBColor)> {
+    fn legend(
+        &self,
+        mark: Mark,
+        others: &[(&str, Mark, RGBColor)],
+    ) -> Vec<(String, Mark, RGBColor)> {
         let starts = self.mission().simulation.starts.iter().zip(COLORS.into_iter().cycle());
         let starts = starts.map(|(start, color)| (format!("from {}", start.name), mark, color));
         let others = others.iter().map(|(name, mark, color)| ((*name).to_owned(), *mark, *color));
@@ -116,8 +121,7 @@ impl Scene<'_> {
     ) -> Result<PathBuf, PictureError> {
         let views = self.views();
         let runs = flown[0].flights.len();
-        let title =
-            format!("{}: {} of each controller", self.mission().name, counted(runs));
+        let title = format!("{}: {} of each controller", self.mission().name, counted(runs));
         let mut others = vec![("docking distance", Mark::Patch, INK)];
         if self.model.cone.is_some() {
             others.push(("cone", Mark::Patch, SKY));
@@ -149,7 +153,8 @@ impl Scene<'_> {
         let flights = || all.iter().flat_map(|campaign| &campaign.flights);
         let mut seen: Points = flights().flat_map(|flight| self.path(flight, view)).collect();
         seen.extend(circle(target, radius));
-        let length = seen.iter().map(|p| (p.0 - target.0).hypot(p.1 - target.1)).fold(0.0, f64::max);
+        let length =
+            seen.iter().map(|p| (p.0 - target.0).hypot(p.1 - target.1)).fold(0.0, f64::max);
         let cone = self.cone(1.2 * length);
         seen.extend(cone.iter().flatten());
         let (x, y) = equal(area, range(seen.iter().map(|p| p.0)), range(seen.iter().map(|p| p.1)));

@@ -133,9 +133,11 @@ impl SamplingFlight {
     /// The largest angle from the wanted attitude once the flight has lasted `settled_s`.
     #[must_use]
     pub fn largest_angle_deg(&self, settled_s: f64) -> Option<f64> {
-        let settled = self.attitude.iter().enumerate().filter(|(k, _)| {
-            *k as f64 * self.sample_time_s >= settled_s
-        });
+        let settled = self
+            .attitude
+            .iter()
+            .enumerate()
+            .filter(|(k, _)| *k as f64 * self.sample_time_s >= settled_s);
         settled.map(|(_, [angle, _])| angle.abs()).reduce(f64::max)
     }
 }
@@ -187,9 +189,10 @@ pub(super) async fn fly(
         if let Some(attitude) = &mut attitude {
             flight.attitude.push(attitude.turn(k, sample_time_s).await?);
         }
-        let near = flight.samples.last().is_some_and(|sample| {
-            sample.distance_m <= simulation.docking.distance_m
-        });
+        let near = flight
+            .samples
+            .last()
+            .is_some_and(|sample| sample.distance_m <= simulation.docking.distance_m);
         if near {
             flight.outcome = SamplingOutcome::Docked;
             break;

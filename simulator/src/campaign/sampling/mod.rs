@@ -101,7 +101,7 @@ pub async fn fly_sampling(
     let attitude = hold(client, &mission).await?;
     let mut campaigns = Vec::new();
     for scheme in chosen(&mission, options)? {
-        let problem = mission.problem_under(scheme);
+        let problem = mission.problem_under(scheme)?;
         let flyable = Flyable {
             mission: mission.clone(),
             model: SamplingModel::new(&problem).map_err(MissionError::Invalid)?,

@@ -201,9 +201,8 @@ impl SamplingSummary {
 
     fn json(&self) -> Map<String, Value> {
         let (p50, p99) = self.latency_ms.unzip();
-        let worst = self.worst_violation.as_ref().map(|(row, share)| {
-            json!({ "row": row, "share": share })
-        });
+        let worst =
+            self.worst_violation.as_ref().map(|(row, share)| json!({ "row": row, "share": share }));
         let members = [
             ("flights", self.flights.into()),
             ("docked", self.docked.into()),

@@ -10,7 +10,14 @@ use crate::{
 };
 
 const TITLES: [&str; 9] = [
-    "from", "flights", "docked", "time to dock [s]", "min", "max", "effort [N s]", "std",
+    "from",
+    "flights",
+    "docked",
+    "time to dock [s]",
+    "min",
+    "max",
+    "effort [N s]",
+    "std",
     "worst row [%]",
 ];
 
