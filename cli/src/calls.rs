@@ -73,6 +73,10 @@ pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
             arguments.mission.refuse(foreign)?;
             return plans::plan(&mission, &arguments.mission.node, &arguments.options).await;
         }
+        MissionFile::OfflineSampling(mission) => {
+            let name = &mission.name;
+            return Err(Failure::usage(format!("the mission {name} is flown step by step")));
+        }
         MissionFile::VariableHorizon(mission) => arguments.mission.under_one_scheme(*mission)?,
     };
     if let Some(name) = arguments.options.given() {

@@ -13,6 +13,7 @@ mod mission;
 mod plans;
 mod precompute;
 mod safety;
+mod sampling;
 mod serve;
 mod session;
 mod simulate;

@@ -24,10 +24,15 @@ pub(crate) struct PrecomputeArguments {
 
 pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
     let problem = match arguments.mission.load()? {
-        MissionFile::DisturbanceFeedback(mission) => {
-            arguments.mission.refuse_for_plans([])?;
+        MissionFile::AbortSafe(mission) => {
+            arguments.mission.refuse([])?;
             mission.problem
         }
+        MissionFile::DisturbanceFeedback(mission) => {
+            arguments.mission.refuse([])?;
+            mission.problem
+        }
+        MissionFile::OfflineSampling(mission) => arguments.mission.sampling_problem(&mission)?,
         MissionFile::VariableHorizon(mission) => {
             arguments.mission.under_one_scheme(*mission)?.problem
         }
