@@ -38,9 +38,9 @@ use crate::{
     wire::{
         Artifact, ArtifactId, Controller, ControllerState, DecidedStep, Document, ElapsedAndState,
         ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer, KeptPlanCall, Limits, PlanAnswer,
-        PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, Problem, Provenance,
-        ReportAnswer, ReportCall, SolverWork, State, StateFault, StepAnswer, StepCall,
-        StoredArtifact, UploadAnswer, UploadCall, VerdictKind,
+        PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, Problem, ReportAnswer,
+        ReportCall, SolverWork, State, StateFault, StepAnswer, StepCall, StoredArtifact,
+        UploadAnswer, UploadCall, VerdictKind,
     },
 };
 use cache::{Cache, Outcome};

@@ -73,7 +73,10 @@ impl Wired for AbortSafe {
         method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
-    fn measurement(measured: &ElapsedAndState) -> Result<method::Measurement, Fault> {
+    fn measurement(
+        _: &method::Artifact,
+        measured: &ElapsedAndState,
+    ) -> Result<method::Measurement, Fault> {
         match &measured.state {
             MeasuredState::Relative(state) => Ok(method::Measurement {
                 state: *state,
