@@ -13,12 +13,13 @@ use vbar_guidance::{
         },
     },
     dynamics::Discretisation,
+    reach::StageFamily,
     sampling::ScalarLaw,
     sets::Polytope,
     units::Seconds,
 };
 
-use crate::double_integrator::{DISTURBANCE, prepare, problem, step};
+use crate::double_integrator::{DISTURBANCE, feasible, prepare, problem, step};
 
 #[test]
 fn offline_sampling_keeps_every_promise_in_closed_loop() {
@@ -83,6 +84,17 @@ fn offline_sampling_without_an_answer_names_rows_or_flies_the_tail() {
     assert!(!reason.rows.is_empty());
     let sum: f64 = reason.rows.iter().map(|row| row.weight).sum();
     assert!((sum - 1.0).abs() < 1e-9, "{sum}");
+    // Rows of a family moved as far as was said leave an answer, a little less leaves none.
+    assert!(!reason.relaxations.is_empty());
+    for relaxation in &reason.relaxations {
+        for (share, enough) in [(1.001, true), (0.99, false)] {
+            let shift = |origin| {
+                let moved = family(origin) == relaxation.family;
+                if moved { share * relaxation.amount } else { 0.0 }
+            };
+            assert_eq!(feasible(&artifact, far.as_slice(), shift), enough, "{relaxation:?}");
+        }
+    }
     assert!(first.certificate.is_none());
     // After a good step there is a plan: its tail is flown, flagged, and inside the input set.
     let good =
@@ -93,6 +105,18 @@ fn offline_sampling_without_an_answer_names_rows_or_flies_the_tail() {
     assert!(command.clipped && command.input.amax() <= 1.0 + 1e-9, "{command:?}");
     let certificate = tail.certificate.unwrap();
     assert!(!certificate.passed && certificate.claim == Claim::PreviousPlanTail);
+}
+
+fn family(origin: RowOrigin) -> ConstraintFamily {
+    match origin {
+        RowOrigin::FirstStep => ConstraintFamily::FirstStep,
+        RowOrigin::Tube => ConstraintFamily::Tube,
+        RowOrigin::Stage(group) => match group.family {
+            StageFamily::State => ConstraintFamily::State,
+            StageFamily::Input => ConstraintFamily::Input,
+            StageFamily::Terminal => ConstraintFamily::Terminal,
+        },
+    }
 }
 
 #[test]

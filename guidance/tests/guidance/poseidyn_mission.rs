@@ -15,8 +15,6 @@ use vbar_guidance::{
 pub(crate) const TARGET_M: [f64; 2] = [0.3, 0.3];
 /// The paper's bound on the components of w.
 pub(crate) const DISTURBANCE: f64 = 5e-3;
-/// Starts A, B and C, from the apex.
-pub(crate) const STARTS_M: [[f64; 2]; 3] = [[2.5, 2.5], [2.9, 1.75], [2.75, 2.1]];
 
 fn diagonal(entries: &[f64]) -> DMatrix<f64> {
     DMatrix::from_diagonal(&DVector::from_column_slice(entries))
