@@ -27,6 +27,9 @@ use vbar_guidance::{
 #[path = "../tests/guidance/poseidyn_mission.rs"]
 mod poseidyn_mission;
 
+/// Starts A, B and C, from the apex of the cone.
+const STARTS_M: [[f64; 2]; 3] = [[2.5, 2.5], [2.9, 1.75], [2.75, 2.1]];
+
 fn main() {
     let mut arguments = std::env::args().skip(1);
     let mut number =
@@ -58,7 +61,7 @@ fn main() {
         start.elapsed().as_secs_f64()
     );
     let [x, y] = poseidyn_mission::TARGET_M;
-    for (name, start) in ["A", "B", "C"].into_iter().zip(poseidyn_mission::STARTS_M) {
+    for (name, start) in ["A", "B", "C"].into_iter().zip(STARTS_M) {
         let violation = set.violation(&[start[0] - x, start[1] - y, 0.0, 0.0]);
         println!("start {name}: violation {violation:.4} m");
     }

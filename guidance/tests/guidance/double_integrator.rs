@@ -8,10 +8,11 @@ use vbar_guidance::{
         Controller, PrepareError,
         offline_sampling::{
             Artifact, Coordinates, CostWeights, GainChoice, Measurement, OfflineSampling, Problem,
-            Redundancy, SampleChoice, Scheme, State, Step,
+            Redundancy, RowOrigin, SampleChoice, Scheme, State, Step,
         },
     },
     dynamics::{Discretisation, MatrixPolynomial, UncertainPlant},
+    program::{DenseRows, DualActiveSet, QuadraticCost, QuadraticProgram, Status},
     reach::{GrowthLimits, InvariantLimits},
     sampling::ScalarLaw,
     sets::Polytope,
@@ -80,4 +81,26 @@ pub(crate) fn prepare(problem: &Problem) -> Result<Artifact, PrepareError> {
 pub(crate) fn step(artifact: &Artifact, state: &State, x: &DVector<f64>) -> Step {
     let measurement = Measurement { state: x.clone(), elapsed: None };
     OfflineSampling::step(artifact, state, &measurement, Budget::UNLIMITED).unwrap()
+}
+
+/// Does any decision satisfy the rows at x, each moved outwards by its `shift` per unit normal? By
+/// a program of its own.
+pub(crate) fn feasible(artifact: &Artifact, x: &[f64], shift: impl Fn(RowOrigin) -> f64) -> bool {
+    let rows = artifact.rows();
+    let width = rows.dimension() - x.len();
+    let (mut lines, mut offsets) = (DenseRows::new(width), Vec::new());
+    for row in 0..rows.len() {
+        let (state, decision) = rows.normal(row).split_at(x.len());
+        let at: f64 = state.iter().zip(x).map(|(a, x)| a * x).sum();
+        lines.push(decision);
+        offsets.push(rows.offset(row) - at + shift(artifact.origin(row)) / lines.scale(row));
+    }
+    let program = QuadraticProgram {
+        cost: &QuadraticCost::identity(width),
+        gradient: &vec![0.0; width],
+        rows: &lines,
+        offsets: &offsets,
+    };
+    let solution = DualActiveSet::default().solve(&program, &[], Budget::UNLIMITED).unwrap();
+    solution.status == Status::Optimal
 }

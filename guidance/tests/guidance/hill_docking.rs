@@ -40,7 +40,7 @@ fn plant() -> UncertainPlant {
             ScalarLaw::Uniform { low: 0.00108, high: 0.00112 },
             ScalarLaw::Uniform { low: 1.0 / 102.0, high: 1.0 / 98.0 },
         ],
-        discretisation: Discretisation::ZeroOrderHold { sample_time_s: 10.0 },
+        discretisation: Discretisation::ZeroOrderHold { sample_time_s: 15.0 },
     }
 }
 
@@ -73,7 +73,7 @@ fn problem() -> Problem {
     });
     let state =
         DMatrix::from_diagonal(&DVector::from_vec(vec![1.0, 1.0, 1.0, 100.0, 100.0, 100.0]));
-    let input = DMatrix::identity(3, 3) * 100.0;
+    let input = DMatrix::identity(3, 3) * 30.0;
     let even = |bound: f64| ScalarLaw::Uniform { low: -bound, high: bound };
     Problem {
         scheme: Scheme::OfflineSampling,
@@ -89,7 +89,7 @@ fn problem() -> Problem {
             violation: 0.05,
             confidence_complement: 1e-3,
             variables: None,
-            size: Some(150),
+            size: Some(15),
             state_at_start: false,
             rows_max: 100_000,
         },

@@ -13,12 +13,13 @@ use vbar_guidance::{
         },
     },
     dynamics::Discretisation,
+    reach::StageFamily,
     sampling::ScalarLaw,
     sets::Polytope,
     units::Seconds,
 };
 
-use crate::double_integrator::{DISTURBANCE, prepare, problem, step};
+use crate::double_integrator::{DISTURBANCE, feasible, prepare, problem, step};
 
 #[test]
 fn offline_sampling_keeps_every_promise_in_closed_loop() {
@@ -93,6 +94,43 @@ fn offline_sampling_without_an_answer_names_rows_or_flies_the_tail() {
     assert!(command.clipped && command.input.amax() <= 1.0 + 1e-9, "{command:?}");
     let certificate = tail.certificate.unwrap();
     assert!(!certificate.passed && certificate.claim == Claim::PreviousPlanTail);
+}
+
+#[test]
+fn offline_sampling_names_the_least_relaxation() {
+    let artifact = prepare(&problem()).unwrap();
+    let start = OfflineSampling::start(&artifact);
+    // Outwards until there is no answer: a little beyond, moving one family can be enough.
+    let mut states = (50..100).map(|share| DVector::from_vec(vec![0.04 * f64::from(share), 0.5]));
+    let (x, why) = states
+        .find_map(|x| match step(&artifact, &start, &x).verdict {
+            Verdict::Command(_) => None,
+            Verdict::Infeasible(why) => Some((x, why)),
+        })
+        .unwrap();
+    assert!(!why.relaxations.is_empty(), "{why:?}");
+    // Rows of a family moved as far as was said leave an answer, a little less leaves none.
+    for relaxation in &why.relaxations {
+        for (share, enough) in [(1.001, true), (0.99, false)] {
+            let shift = |origin| {
+                let moved = family(origin) == relaxation.family;
+                if moved { share * relaxation.amount } else { 0.0 }
+            };
+            assert_eq!(feasible(&artifact, x.as_slice(), shift), enough, "{relaxation:?}");
+        }
+    }
+}
+
+fn family(origin: RowOrigin) -> ConstraintFamily {
+    match origin {
+        RowOrigin::FirstStep => ConstraintFamily::FirstStep,
+        RowOrigin::Tube => ConstraintFamily::Tube,
+        RowOrigin::Stage(group) => match group.family {
+            StageFamily::State => ConstraintFamily::State,
+            StageFamily::Input => ConstraintFamily::Input,
+            StageFamily::Terminal => ConstraintFamily::Terminal,
+        },
+    }
 }
 
 #[test]

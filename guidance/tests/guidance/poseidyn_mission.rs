@@ -15,8 +15,6 @@ use vbar_guidance::{
 pub(crate) const TARGET_M: [f64; 2] = [0.3, 0.3];
 /// The paper's bound on the components of w.
 pub(crate) const DISTURBANCE: f64 = 5e-3;
-/// Starts A, B and C, from the apex.
-pub(crate) const STARTS_M: [[f64; 2]; 3] = [[2.5, 2.5], [2.9, 1.75], [2.75, 2.1]];
 
 fn diagonal(entries: &[f64]) -> DMatrix<f64> {
     DMatrix::from_diagonal(&DVector::from_column_slice(entries))
@@ -55,8 +53,15 @@ fn state_set() -> Polytope {
 
 /// With `size` samples a group.
 pub(crate) fn problem(size: usize) -> Problem {
-    // The weights under which the independent implementation reproduces the paper.
-    let (state, input) = (diagonal(&[1e6, 1e6, 1e8, 1e8]), diagonal(&[1e6, 1e6]));
+    // The paper gives the weights of the cost, and of K only that it is robust: with these weights
+    // of a regulator the independent implementation reproduces the paper's efforts.
+    let gain =
+        GainChoice::Lqr { state: diagonal(&[1e6, 1e6, 1e8, 1e8]), input: diagonal(&[1e6, 1e6]) };
+    let weights = CostWeights {
+        state: diagonal(&[1e4, 1e4, 1e8, 1e8]),
+        input: diagonal(&[1e6, 1e6]),
+        samples: 1000,
+    };
     Problem {
         scheme: Scheme::OfflineSampling,
         plant: poseidyn(PoseidynVariant::Printed, 9.882, 5.0),
@@ -64,8 +69,8 @@ pub(crate) fn problem(size: usize) -> Problem {
         vertices: None,
         disturbance: vec![ScalarLaw::TruncatedGaussian { deviation: 1.0, bound: DISTURBANCE }; 4],
         horizon: 10,
-        gain: GainChoice::Lqr { state: state.clone(), input: input.clone() },
-        weights: CostWeights { state, input, samples: 1000 },
+        gain,
+        weights,
         state_set: state_set(),
         input_set: polytope(&within(0, 2, 0.3).collect::<Vec<_>>()),
         samples: SampleChoice {

@@ -12,19 +12,26 @@
 //!
 //! # Offline
 //! K, the terminal set (the largest robust invariant one under K), P, the expected cost; then a
-//! row of D for every sample and constraint, group by group ([`Controller::run_shard`]), without
-//! redundant ones; then a robust control invariant set grown from the terminal set, and D_R: every
-//! successor lies in it.
+//! row of D for every sample and constraint, without redundant ones, part by part
+//! ([`Controller::run_shard`]) and then all together; then, if asked for, a robust control
+//! invariant set grown from the terminal set, and D_R: every successor lies in it.
+//!
+//! Two baselines share problem, artifact and step ([`Scheme`]): nothing is sampled for them, and
+//! one shard makes the whole artifact.
 //!
 //! # Online
-//! [`Controller::step`]: one dense quadratic program over the corrections, u = K x + v_0.
+//! [`Controller::step`]: one dense quadratic program over the corrections (and with a tube over
+//! the place of the state in it), u = K x + v_0.
 //!
 //! # Guarantee and its assumptions
-//! If the plants lie in the hull of the vertices and w in its bounds: from a state in the first-
-//! step set every later step has an answer; the input constraints hold; each state constraint
-//! holds with probability 1 - epsilon, with confidence 1 - delta for each sampled group, and all
-//! groups together with the confidence that the artifact states. Where no answer exists all the
-//! same, the last plan's tail is flown, clipped, and flagged: it carries no guarantee.
+//! If the plants lie in the hull of the vertices and w in its bounds: the input of the present
+//! step is within its constraints, and each constraint on later states and inputs, as predicted,
+//! holds with probability 1 - epsilon, with confidence 1 - delta for each sampled row, and all
+//! together with the confidence that the artifact states ([`Artifact::confidence_statement`]).
+//! With a first-step set, from a state with an answer every later step has one too. Where no
+//! answer exists all the same, the last plan's tail is flown, clipped, and flagged: it carries no
+//! guarantee. [`Scheme::TubeRobust`] keeps every constraint at every step, from any state with an
+//! answer; [`Scheme::LinearQuadratic`] promises nothing.
 //!
 //! # Where we differ from the paper
 //! - The constant in z = (x, v, 1) replaces the printed blocks of (7) and appendix A.
@@ -33,11 +40,14 @@
 //! - C_T is not projected from n + T m dimensions: the first-step set is grown from inside.
 //! - Exact removal of redundant rows, or scaled inner sets: removing nearly redundant rows alone
 //!   would leave an outer set, with violations.
+//! - The paper does not publish its baselines' data. Ours: the expected plant under the same
+//!   constraints, and a tube around it into which the plant's uncertainty is lumped.
 //!
 //! # References
 //! \[Mammarella2019\].
 
 mod artifact;
+mod conflict;
 mod design;
 mod encoding;
 mod nominal;

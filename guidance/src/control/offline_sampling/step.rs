@@ -2,17 +2,17 @@
 
 use nalgebra::DVector;
 
-use super::{Artifact, RowOrigin, Scheme, State};
+use super::{Artifact, RowOrigin, Scheme, State, conflict::conflict};
 use crate::{
     budget::Budget,
     control::{
         Certificate, Claim, ConstraintFamily, ConstraintMargin, Failure, Fault, Infeasibility,
-        ProofRow, StepError,
+        StepError,
     },
     matrices::times_vector,
     program::{
-        ActiveRow, Clarabel, DenseRows, DualActiveSet, QuadraticCost, QuadraticProgram,
-        QuadraticSolution, Status, prove_infeasible, verify_quadratic,
+        Clarabel, DenseRows, DualActiveSet, QuadraticCost, QuadraticProgram, QuadraticSolution,
+        Status, prove_infeasible, verify_quadratic,
     },
     reach::{StageFamily, StageGroup},
     units::Seconds,
@@ -131,7 +131,7 @@ pub(super) fn step(
         conflict: None,
     };
     if solution.status == Status::PrimalInfeasible {
-        return present.fall_back(&program, &solution, diagnostics);
+        return present.fall_back(&program, &solution, diagnostics, budget);
     }
     let certificate = certify(artifact, &program, &solution, present.x, Claim::Global);
     if !certificate.passed {
@@ -232,9 +232,10 @@ impl<'a> Present<'a> {
         program: &QuadraticProgram<'_>,
         solution: &QuadraticSolution,
         diagnostics: Diagnostics,
+        budget: Budget<'_>,
     ) -> Result<Step, StepError> {
         let artifact = self.artifact;
-        let conflict = conflict(artifact, program, &solution.active);
+        let conflict = conflict(artifact, program, &solution.active, budget)?;
         let mut diagnostics = Diagnostics { conflict: Some(conflict.clone()), ..diagnostics };
         let Some(tail) = &self.tail else {
             return Ok(Step {
@@ -395,37 +396,8 @@ fn certify(
     }
 }
 
-/// The rows that exclude each other, heaviest first.
-fn conflict(
-    artifact: &Artifact,
-    program: &QuadraticProgram<'_>,
-    ray: &[ActiveRow],
-) -> Infeasibility {
-    let weight = |active: &ActiveRow| active.multiplier / program.rows.scale(active.row);
-    let sum: f64 = ray.iter().map(weight).sum();
-    let mut rows: Vec<ProofRow> = ray
-        .iter()
-        .map(|active| {
-            let (family, stage) = family(artifact.origin(active.row));
-            ProofRow { family, stage, row: active.row, weight: weight(active) / sum }
-        })
-        .collect();
-    rows.sort_by(|a, b| b.weight.total_cmp(&a.weight).then(a.row.cmp(&b.row)));
-    let margin = prove_infeasible(program.rows, program.offsets, ray).margin;
-    Infeasibility {
-        reason: format!(
-            "no corrections satisfy {} rows together; they miss by {margin:.3e}",
-            rows.len()
-        ),
-        horizon: artifact.problem().horizon,
-        rows,
-        relaxations: Vec::new(),
-        all_horizons_proved: true,
-    }
-}
-
 /// The family and stage of a row; the first-step rows bound the state of stage 1.
-fn family(origin: RowOrigin) -> (ConstraintFamily, usize) {
+pub(super) fn family(origin: RowOrigin) -> (ConstraintFamily, usize) {
     match origin {
         RowOrigin::FirstStep => (ConstraintFamily::FirstStep, 1),
         RowOrigin::Tube => (ConstraintFamily::Tube, 0),
