@@ -129,7 +129,7 @@ impl Counts {
             "{what}: of {STATES} states {found} with an abort, {none} without (proved), \
              {undecided} undecided; {inside} inside a reachable set"
         );
-        assert!(*found > STATES / 10 && *inside > STATES / 100, "a vain test");
+        assert!(*found > STATES / 10 && *inside > STATES / 200, "a vain test");
         assert!(*inside <= *none + *undecided);
     }
 }
@@ -194,5 +194,5 @@ fn free_drift_that_is_safe_stays_out_between_samples_too() {
     }
     counts.print("total failure");
     assert_eq!(counts.undecided, 0, "drift leaves nothing open");
-    assert!(crossings < STATES / 100, "{crossings} crossings between instants");
+    assert!(crossings < STATES / 50, "{crossings} crossings between instants");
 }
