@@ -259,7 +259,7 @@ async fn malformed_abort_safe_weights_are_named() {
     let mut lopsided = vec![0.0; 36];
     (0..6).for_each(|i| lopsided[7 * i] = 1.0);
     lopsided[1] = 0.5;
-    let matrix = |size: i32, values: Vec<f64>| json!({ "matrix": { "rows": size, "columns": size, "values": values } });
+    let matrix = |rows: i32, values: Vec<f64>| json!({ "matrix": { "rows": rows, "columns": 6, "values": values } });
     let diagonal = |values: Vec<f64>| json!({ "diagonal": { "values": values } });
     check(
         &server,
