@@ -93,11 +93,10 @@ async fn malformed_abort_safe_sample_time_comes_with_those_that_fit() {
     let mut problem = station();
     problem["abortSafe"]["orbit"]["elements"] =
         json!({ "semiMajorAxisM": 7_419_320.0, "eccentricity": 0.1, "trueAnomalyDeg": 140.0 });
-    for phase in 0..2 {
-        let watch = &mut problem["abortSafe"]["phases"][phase]["passive"]["watch"];
-        watch["horizonSteps"] = json!(4);
-    }
-    problem["abortSafe"]["phases"][2]["active"]["watch"]["horizonSteps"] = json!(4);
+    let mut phase = problem["abortSafe"]["phases"][1].clone();
+    phase["passive"]["watch"]["horizonSteps"] = json!(4);
+    phase.as_object_mut().unwrap().remove("advanceWithinM");
+    problem["abortSafe"]["phases"] = json!([phase]);
     let with_step = |step_s: f64| with(problem.clone(), "/sampleTimeS", json!(step_s));
     // The period is 212 samples of 30 s within 0.3 ms.
     let accepted = json!({ "problem": with_step(30.0), "validateOnly": true });
@@ -260,7 +259,7 @@ async fn malformed_abort_safe_weights_are_named() {
     let mut lopsided = vec![0.0; 36];
     (0..6).for_each(|i| lopsided[7 * i] = 1.0);
     lopsided[1] = 0.5;
-    let matrix = |size: i32, values: Vec<f64>| json!({ "matrix": { "rows": size, "columns": size, "values": values } });
+    let matrix = |rows: i32, values: Vec<f64>| json!({ "matrix": { "rows": rows, "columns": 6, "values": values } });
     let diagonal = |values: Vec<f64>| json!({ "diagonal": { "values": values } });
     check(
         &server,
@@ -272,7 +271,7 @@ async fn malformed_abort_safe_weights_are_named() {
             (stage, diagonal(vec![1.0; 3]), "phases[1].weights.stage.diagonal.values"),
             (terminal, diagonal(vec![1.0, 1.0, -1.0, 1.0, 1.0, 1.0]), "phases[1].weights.terminal"),
             (terminal, matrix(6, lopsided), "phases[1].weights.terminal"),
-            (terminal, matrix(3, vec![0.0; 9]), "phases[1].weights.terminal.matrix.rows"),
+            (terminal, matrix(3, vec![0.0; 18]), "phases[1].weights.terminal.matrix.rows"),
             (input, json!({ "identityTimes": 0.0 }), "phases[1].weights.input"),
             (input, diagonal(vec![1.0, 0.0, 1.0]), "phases[1].weights.input"),
         ],
