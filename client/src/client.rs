@@ -20,9 +20,9 @@ use vbar_proto::{
         Artifact, ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
         GetArtifactRequest, GetPlanRequest, GetPlanResponse, GetServerInfoRequest,
         GetServerInfoResponse, ListPlansRequest, ListPlansResponse, PrecomputeRequest,
-        PrecomputeResponse, Problem, StepRequest, StepResponse, UploadPlanRequest,
-        UploadPlanResponse, guidance_service_client::GuidanceServiceClient,
-        step_stream_request::Controller,
+        PrecomputeResponse, Problem, SafetyReportRequest, SafetyReportResponse, StepRequest,
+        StepResponse, UploadPlanRequest, UploadPlanResponse,
+        guidance_service_client::GuidanceServiceClient, step_stream_request::Controller,
     },
 };
 
@@ -189,6 +189,22 @@ impl Client {
         self.call(self.options.deadline, request, |request| {
             let mut guidance = self.guidance.clone();
             async move { guidance.step(request).await }
+        })
+        .await
+    }
+
+    /// What could be done along a trajectory if thrusters failed.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` if the node does not have the artifact or plan; `RESOURCE_EXHAUSTED` for a
+    /// report too large for one answer; [`Error`], as every call.
+    pub async fn safety_report(
+        &self,
+        request: SafetyReportRequest,
+    ) -> Result<SafetyReportResponse, Error> {
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.safety_report(request).await }
         })
         .await
     }

@@ -27,8 +27,9 @@ use vbar_proto::{
         Artifact, ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
         GetArtifactRequest, GetArtifactResponse, GetPlanRequest, GetPlanResponse,
         GetServerInfoRequest, GetServerInfoResponse, ListPlansRequest, ListPlansResponse,
-        Measurement, PrecomputeRequest, PrecomputeResponse, Problem, StepRequest, StepResponse,
-        StepStreamRequest, StepStreamResponse, UploadPlanRequest, UploadPlanResponse,
+        Measurement, PrecomputeRequest, PrecomputeResponse, Problem, SafetyReportRequest,
+        SafetyReportResponse, SafetySummary, StepRequest, StepResponse, StepStreamRequest,
+        StepStreamResponse, UploadPlanRequest, UploadPlanResponse,
         guidance_service_server::{GuidanceService, GuidanceServiceServer},
         precompute_response::Outcome,
         step_stream_request::Controller,
@@ -167,6 +168,16 @@ impl GuidanceService for Scripted {
     async fn step(&self, request: Request<StepRequest>) -> Result<Response<StepResponse>, Status> {
         self.follow(&request).await?;
         Ok(Response::new(StepResponse { step_index: 7, ..StepResponse::default() }))
+    }
+
+    async fn safety_report(
+        &self,
+        request: Request<SafetyReportRequest>,
+    ) -> Result<Response<SafetyReportResponse>, Status> {
+        self.follow(&request).await?;
+        let verdicts = request.into_inner().first_step_index;
+        let summary = Some(SafetySummary { verdicts, ..SafetySummary::default() });
+        Ok(Response::new(SafetyReportResponse { summary, ..SafetyReportResponse::default() }))
     }
 
     /// Each answer's controller state is the number of messages this node has seen.

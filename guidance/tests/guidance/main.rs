@@ -4,6 +4,7 @@
 
 mod abort_safe_loop;
 mod abort_safety;
+mod abort_search;
 mod disturbance_feedback_golden;
 mod disturbance_feedback_laws;
 mod double_integrator;

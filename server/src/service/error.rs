@@ -10,7 +10,7 @@ use vbar_guidance::{
 use crate::{
     compute::ComputeError,
     store::StoreError,
-    wire::{Missing, StateFault, Violation, Violations},
+    wire::{Missing, ReportFault, StateFault, Violation, Violations},
 };
 
 /// The codes of `google.rpc.Code` that this service answers with.
@@ -145,6 +145,18 @@ impl From<Violations> for Error {
 
 fn place(path: &str) -> &str {
     if path.is_empty() { "the request" } else { path }
+}
+
+impl From<ReportFault> for Error {
+    fn from(fault: ReportFault) -> Self {
+        match fault {
+            ReportFault::Violations(violations) => violations.into(),
+            ReportFault::Interrupted(interruption) => Failure::from(interruption).into(),
+            ReportFault::TooLarge(what) => {
+                Self::new(Code::ResourceExhausted, "REPORT_TOO_LARGE", what)
+            }
+        }
+    }
 }
 
 impl From<StateFault> for Error {

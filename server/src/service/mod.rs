@@ -29,8 +29,8 @@ use crate::{
         DecidedStep, Document, ElapsedAndState, ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer,
         KeptPlanCall, Limits, OperationAnswer, OperationName, OperationsAnswer, OperationsCall,
         PlanAnswer, PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, PrecomputeCall,
-        Problem, Provenance, SolverWork, State, StateFault, StepAnswer, StepCall, UploadAnswer,
-        UploadCall, VerdictKind,
+        Problem, Provenance, ReportAnswer, ReportCall, SolverWork, State, StateFault, StepAnswer,
+        StepCall, UploadAnswer, UploadCall, VerdictKind,
     },
 };
 use cache::{Cache, Outcome};
@@ -114,6 +114,31 @@ impl Service {
         let state = StateSource::Envelope(ask.controller_state);
         let decided = self.decide(artifact, state, ask.measurement, ask.omit_prediction, call);
         decided.await.map(|timed| timed.map(StepAnswer::Decided))
+    }
+
+    /// `SafetyReport`.
+    pub(crate) async fn safety_report(
+        &self,
+        ask: ReportCall,
+        call: &Call,
+    ) -> Result<Timed<ReportAnswer>, Error> {
+        let loaded = match self.controller(ask.controller, call).await? {
+            Found::Controller(loaded) => loaded,
+            Found::None(_) => {
+                let message = "no controller exists for the problem";
+                return Err(Error::new(Code::FailedPrecondition, "NO_CONTROLLER", message));
+            }
+        };
+        let question = ask.question;
+        let plan = match question.plan() {
+            Some(id) => Some(self.load(Shelf::Plans, id, call).await?.artifact),
+            None => None,
+        };
+        let Loaded { artifact, provenance, .. } = loaded;
+        let work =
+            move |budget: Budget<'_>| question.judge(artifact, plan.as_ref(), provenance, budget);
+        let timed = self.compute.run("safety_report", call.deadline, work).await?;
+        Ok(Timed { value: timed.value?, compute: timed.compute })
     }
 
     /// `ComputePlan`. What can be flown as it is, is kept.
@@ -352,6 +377,7 @@ impl Service {
         self.count(answer.step.work());
         let outcome = match answer.step.kind() {
             VerdictKind::Command => "command",
+            VerdictKind::Abort => "abort",
             VerdictKind::Arrived => "arrived",
             VerdictKind::Infeasible => "infeasible",
         };

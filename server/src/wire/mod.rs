@@ -4,6 +4,7 @@
 //! Nothing is repaired here. A value is taken as it is or refused; where a message leaves a choice
 //! to the server, the `.proto` file says which one is made.
 
+mod abort_safe;
 mod calls;
 mod controller_state;
 mod disturbance_feedback;
@@ -16,6 +17,7 @@ mod variable_horizon;
 
 use std::fmt;
 
+pub(crate) use abort_safe::{ReportAnswer, ReportCall, ReportFault};
 pub(crate) use calls::{
     ArtifactAnswer, ArtifactCall, Controller, DecidedStep, ExportCall, InfoAnswer, InfoCall,
     KeptPlanAnswer, KeptPlanCall, NamedBy, OperationAnswer, OperationName, OperationsAnswer,

@@ -45,20 +45,30 @@
 
 mod answer;
 mod artifact;
+mod cuts;
 mod encoding;
+mod faults;
+mod leave;
 mod problem;
+mod regulator;
 mod safety;
 mod state;
 mod step;
+mod summary;
+mod unsafe_state;
 
 pub use answer::{
-    AbortCommand, AbortReason, Arrival, Command, Diagnostics, Measurement, ModeVerdict,
-    StateVerdict, Step, Trajectory, Verdict,
+    AbortCommand, AbortOrigin, AbortReason, Arrival, Command, Diagnostics, Measurement,
+    ModeVerdict, StateVerdict, Step, Trajectory, UnsafeState, Verdict,
 };
-pub use artifact::{Artifact, PhaseSummary, Shard, Summary};
-pub use problem::{Fallback, Phase, Problem, Safety, SetTiming, Watch, Weights};
-pub use safety::safety_report;
+pub use artifact::{Artifact, Shard};
+pub use faults::{
+    FRACTIONS_MAX, INSTANTS_MAX, NEAREST_MAX, NUMBERS_MAX, PREDICTION_MAX, STEPS_MAX,
+};
+pub use problem::{Fallback, Phase, Problem, Safety, Separation, SetTiming, Watch, Weights};
+pub use safety::{SafetyQuestion, safety_report};
 pub use state::State;
+pub use summary::{PhaseSummary, Summary};
 
 use super::{Controller, PrepareError, StepError};
 use crate::budget::Budget;
@@ -87,8 +97,7 @@ impl Controller for AbortSafe {
         shard: usize,
         budget: Budget<'_>,
     ) -> Result<Shard, PrepareError> {
-        budget.check()?;
-        artifact::run_shard(problem, shard)
+        artifact::run_shard(problem, shard, budget)
     }
 
     fn merge(

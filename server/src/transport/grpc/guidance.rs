@@ -121,6 +121,17 @@ impl GuidanceService for Grpc {
         Ok(Response::new(Box::pin(answers)))
     }
 
+    async fn safety_report(
+        &self,
+        request: Request<v1::SafetyReportRequest>,
+    ) -> Result<Response<v1::SafetyReportResponse>, Status> {
+        self.call(request, async |service: &Service, ask, call| {
+            service.safety_report(ask, &call).await
+        })
+        .await
+        .map(|timed| respond(timed.map(|answer| answer.render())))
+    }
+
     async fn get_server_info(
         &self,
         request: Request<v1::GetServerInfoRequest>,

@@ -62,6 +62,7 @@ pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Rout
         .route("/v1/operations/{id}", any(operation))
         .route("/v1/artifacts/{id}", get(get_artifact))
         .route("/v1/step", post(step))
+        .route("/v1/safety:report", post(safety_report))
         .route("/v1/info", get(info))
         .route("/healthz", get(async || text(StatusCode::OK, "alive\n")))
         .route("/readyz", get(ready))
@@ -133,6 +134,14 @@ async fn step(State(http): Shared, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, body)| {
         let (ask, call) = http.message::<_, v1::StepRequest>(&parts, body).await?;
         Ok(timed(http.service.step(ask, &call).await?))
+    })
+    .await
+}
+
+async fn safety_report(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, body)| {
+        let (ask, call) = http.message::<_, v1::SafetyReportRequest>(&parts, body).await?;
+        Ok(timed(http.service.safety_report(ask, &call).await?))
     })
     .await
 }

@@ -26,7 +26,7 @@ enum Body {
     Optional,
 }
 
-const ROUTES: [Route; 14] = [
+const ROUTES: [Route; 15] = [
     route("post", "/v1/plans:compute", "vbar.v1.GuidanceService.ComputePlan", Body::Required),
     route("post", "/v1/plans", "vbar.v1.GuidanceService.UploadPlan", Body::Required),
     bare("get", "/v1/plans", "vbar.v1.GuidanceService.ListPlans"),
@@ -34,6 +34,7 @@ const ROUTES: [Route; 14] = [
     bare("get", EXPORT, "vbar.v1.GuidanceService.ExportPlan"),
     route("post", "/v1/precompute", "vbar.v1.GuidanceService.Precompute", Body::Required),
     route("post", "/v1/step", "vbar.v1.GuidanceService.Step", Body::Required),
+    route("post", "/v1/safety:report", "vbar.v1.GuidanceService.SafetyReport", Body::Required),
     bare("get", "/v1/info", "vbar.v1.GuidanceService.GetServerInfo"),
     bare("get", "/v1/artifacts/{id}", "vbar.v1.GuidanceService.GetArtifact"),
     bare("get", "/v1/operations", "google.longrunning.Operations.ListOperations"),
@@ -215,7 +216,8 @@ fn responses(route: &Route, answer: Value) -> Value {
         ("503", "The artifact store does not answer, or the server is shutting down."),
         ("504", "No certified answer was found before the deadline."),
     ];
-    if route.path.contains("{id}") || route.path == "/v1/step" {
+    let names_one = ["/v1/step", "/v1/safety:report"].contains(&route.path);
+    if route.path.contains("{id}") || names_one {
         errors.push(("404", "There is no such artifact, plan or operation."));
     }
     if route.body.is_some() {
