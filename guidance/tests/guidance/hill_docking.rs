@@ -7,42 +7,17 @@ use vbar_guidance::{
     control::{
         Controller,
         offline_sampling::{
-            Branch, CostWeights, GainChoice, OfflineSampling, Problem, Redundancy, SampleChoice,
-            Scheme, Verdict,
+            Branch, Coordinates, CostWeights, GainChoice, OfflineSampling, Problem, Redundancy,
+            SampleChoice, Scheme, Verdict,
         },
     },
-    dynamics::{Discretisation, MatrixPolynomial, Monomial, UncertainPlant},
+    dynamics::uncertain_hill,
     reach::InvariantLimits,
     sampling::ScalarLaw,
     sets::Polytope,
 };
 
 use crate::double_integrator::{prepare, step};
-
-/// Position and velocity in RTN, force in N; q_1 is the mean motion in rad/s, q_2 one over the
-/// mass in kg.
-fn plant() -> UncertainPlant {
-    let entry = |rows: usize, columns: usize, entries: &[(usize, usize, f64)]| {
-        let mut matrix = DMatrix::zeros(rows, columns);
-        entries.iter().for_each(|&(i, j, value)| matrix[(i, j)] = value);
-        matrix
-    };
-    let mut a = MatrixPolynomial::constant(entry(6, 6, &[(0, 3, 1.0), (1, 4, 1.0), (2, 5, 1.0)]))
-        .with_linear(0, entry(6, 6, &[(3, 4, 2.0), (4, 3, -2.0)]));
-    let squared = entry(6, 6, &[(3, 0, 3.0), (5, 2, -1.0)]);
-    a.terms.push(Monomial { powers: vec![2], matrix: squared });
-    let push = entry(6, 3, &[(3, 0, 1.0), (4, 1, 1.0), (5, 2, 1.0)]);
-    UncertainPlant {
-        a,
-        b: MatrixPolynomial::constant(DMatrix::zeros(6, 3)).with_linear(1, push),
-        b_w: MatrixPolynomial::constant(DMatrix::identity(6, 6)),
-        parameters: vec![
-            ScalarLaw::Uniform { low: 0.00108, high: 0.00112 },
-            ScalarLaw::Uniform { low: 1.0 / 102.0, high: 1.0 / 98.0 },
-        ],
-        discretisation: Discretisation::ZeroOrderHold { sample_time_s: 15.0 },
-    }
-}
 
 /// From along the track, in a pyramid of 20 degrees whose apex is 2 m behind the target, to 60 m;
 /// 0.5 m/s on every axis.
@@ -77,7 +52,8 @@ fn problem() -> Problem {
     let even = |bound: f64| ScalarLaw::Uniform { low: -bound, high: bound };
     Problem {
         scheme: Scheme::OfflineSampling,
-        plant: plant(),
+        plant: uncertain_hill((0.00108, 0.00112), (98.0, 102.0), 15.0),
+        coordinates: Coordinates::Rtn,
         vertices: None,
         disturbance: [vec![even(0.01); 3], vec![even(0.002); 3]].concat(),
         horizon: 6,

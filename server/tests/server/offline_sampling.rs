@@ -9,7 +9,7 @@ use vbar_server::Config;
 
 use crate::{
     missions,
-    support::{Server, detail, grpc_fields, json_fields, server, server_with, step_request},
+    support::{Server, detail, grpc_fields, json_fields, server, server_with},
 };
 
 /// A row-major matrix.
@@ -34,7 +34,7 @@ fn symmetric(n: usize, first: usize, sizes: &[f64]) -> Value {
     }
     json!({
         "normals": { "rows": 2 * sizes.len(), "columns": n, "values": values },
-        "offsets": [sizes, sizes].concat(),
+        "offsets": ([sizes, sizes].concat()),
     })
 }
 
@@ -289,18 +289,20 @@ async fn sampling_without_an_answer_names_rows_or_flies_the_tail() {
 #[tokio::test(flavor = "multi_thread")]
 async fn sampling_first_step_set_is_an_option() {
     let server = server().await;
-    let with = precompute(&server, &integrator()).await;
+    // Not grown at all, the first step must lead into the terminal set.
     let mut problem = integrator();
+    problem["offlineSampling"]["firstStepSet"]["rounds"] = json!(0);
+    let with = precompute(&server, &problem).await;
     let asked = problem["offlineSampling"].as_object_mut().unwrap();
     asked.remove("firstStepSet");
     asked.insert("noFirstStepSet".into(), json!({}));
     let without = precompute(&server, &problem).await;
     assert_eq!(summary(&without).first_step_rows, 0);
     assert_eq!(summary(&without).expected_cost_sha256, summary(&with).expected_cost_sha256);
-    // Starts that the samples alone allow, and the set does not: there are some near its edge.
+    // Starts that the samples alone allow, and the set does not.
     let mut families = BTreeMap::new();
-    for i in 0..24 {
-        let measurement = linear(&[2.0 + 0.05 * f64::from(i), 1.0]);
+    for i in 0..16 {
+        let measurement = linear(&[0.25 * f64::from(i), 0.5]);
         let ask = |id: &str| json!({ "artifactId": id, "measurement": measurement });
         let strict = step(&server, &ask(&with.artifact_id)).await;
         let free = step(&server, &ask(&without.artifact_id)).await;
