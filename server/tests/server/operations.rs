@@ -7,7 +7,6 @@ use bytes::Bytes;
 use prost::Message as _;
 use serde_json::{Value, json};
 use tonic::Code;
-use tonic_types::StatusExt as _;
 use vbar_proto::{
     google::longrunning::{
         CancelOperationRequest, DeleteOperationRequest, GetOperationRequest, ListOperationsRequest,
@@ -228,7 +227,7 @@ async fn operation_slow_is_answered_at_once_watched_and_cancelled() {
     let cancelled = wait(&server, &begun.name).await;
     let Some(operation::Result::Error(error)) = &cancelled.result else { panic!("{cancelled:?}") };
     assert_eq!(error.code, Code::Cancelled as i32);
-    assert!(error.get_error_details().error_info().is_some());
+    assert!(error.details.iter().any(|detail| detail.type_url.ends_with("google.rpc.ErrorInfo")));
     assert_eq!(server.metric("vbar_jobs_total{outcome=\"cancelled\"}").await, 1.0);
     // The thread is free again for the one that waited.
     assert!(wait(&server, &queued.name).await.done);
