@@ -35,6 +35,7 @@ pub struct Node {
     local_address: SocketAddr,
     draining: watch::Sender<bool>,
     service: Arc<Service>,
+    shutdown_grace: Duration,
     task: JoinHandle<()>,
 }
 
@@ -115,9 +116,10 @@ impl Node {
         };
         let front = Front::new(Arc::clone(&service), options).await;
         tracing::info!(%local_address, "listening");
+        let shutdown_grace = config.shutdown_grace;
         let port = Port { front, metrics, config };
         let task = tokio::spawn(port.serve(listener, drain));
-        Ok(Self { local_address, draining, service, task })
+        Ok(Self { local_address, draining, service, shutdown_grace, task })
     }
 
     /// Where it listens.
@@ -130,11 +132,13 @@ impl Node {
     /// handed back to the store, calls under way finished within the grace period.
     pub async fn shutdown(self) {
         self.draining.send_replace(true);
-        let service = self.service;
-        if let Err(fault) = tokio::task::spawn_blocking(move || service.stop()).await {
+        let (service, grace) = (self.service, self.shutdown_grace);
+        let stop = tokio::task::spawn_blocking(move || service.stop(grace));
+        let (stopped, ended) = tokio::join!(stop, self.task);
+        if let Err(fault) = stopped {
             tracing::error!(%fault, "jobs were not handed back");
         }
-        if let Err(fault) = self.task.await {
+        if let Err(fault) = ended {
             tracing::error!(%fault, "the node did not stop well");
         }
     }

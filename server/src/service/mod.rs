@@ -140,9 +140,10 @@ impl Service {
         self.jobs.sweep(now);
     }
 
-    /// Hands back what jobs are at and lets nobody wait any longer. Blocks on the store.
-    pub(crate) fn stop(&self) {
-        self.jobs.stop();
+    /// Hands back what jobs are at and lets nobody wait any longer. Blocks on the store, and on
+    /// threads that are slow to stop for at most `grace`.
+    pub(crate) fn stop(&self, grace: Duration) {
+        self.jobs.stop(grace);
     }
 
     /// The limits in force.

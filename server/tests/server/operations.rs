@@ -7,7 +7,6 @@ use bytes::Bytes;
 use prost::Message as _;
 use serde_json::{Value, json};
 use tonic::Code;
-use tonic_types::StatusExt as _;
 use vbar_proto::{
     google::longrunning::{
         CancelOperationRequest, DeleteOperationRequest, GetOperationRequest, ListOperationsRequest,
@@ -69,7 +68,7 @@ pub(crate) fn numbered(number: u32) -> Value {
 /// A plan of so many burns with so little thrust that it takes many seconds.
 fn slow() -> Value {
     let mut problem = missions::prisma_6000_s(0.2);
-    problem["disturbanceFeedback"]["instants"]["equalTime"]["count"] = 64.into();
+    problem["disturbanceFeedback"]["instants"]["equalTime"]["count"] = 48.into();
     problem
 }
 
@@ -228,7 +227,7 @@ async fn operation_slow_is_answered_at_once_watched_and_cancelled() {
     let cancelled = wait(&server, &begun.name).await;
     let Some(operation::Result::Error(error)) = &cancelled.result else { panic!("{cancelled:?}") };
     assert_eq!(error.code, Code::Cancelled as i32);
-    assert!(error.get_error_details().error_info().is_some());
+    assert!(error.details.iter().any(|detail| detail.type_url.ends_with("google.rpc.ErrorInfo")));
     assert_eq!(server.metric("vbar_jobs_total{outcome=\"cancelled\"}").await, 1.0);
     // The thread is free again for the one that waited.
     assert!(wait(&server, &queued.name).await.done);
@@ -329,7 +328,8 @@ async fn operations_survive_their_node() {
     const PROBLEMS: u32 = 12;
     let folder = tempfile::tempdir().unwrap();
     let store = StoreLocation::Directory(folder.path().to_owned());
-    let config = Config { store, ..impatient() };
+    // A solver that is at a large step looks up late on a busy machine.
+    let config = Config { store, shutdown_grace: Duration::from_secs(60), ..impatient() };
     let first = server_with(config.clone()).await;
     let slow = begin(&first, &slow()).await;
     let mut names = Vec::new();

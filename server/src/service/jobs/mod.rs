@@ -15,6 +15,7 @@ use std::{
     fmt::Debug,
     io,
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    thread::{self, JoinHandle},
     time::{Duration, Instant, SystemTime},
 };
 
@@ -137,6 +138,7 @@ pub(super) struct View {
 #[derive(Debug)]
 pub(super) struct Jobs<W: Work> {
     inner: Arc<Inner<W>>,
+    threads: Vec<JoinHandle<()>>,
     /// Set when nobody should wait any longer.
     closing: watch::Sender<bool>,
 }
@@ -176,8 +178,8 @@ impl<W: Work> Jobs<W> {
             journal: Mutex::new(requests),
         });
         inner.recover(restore).map_err(io::Error::other)?;
-        threads::start(&inner)?;
-        Ok(Self { inner, closing: watch::Sender::new(false) })
+        let threads = threads::start(&inner)?;
+        Ok(Self { inner, threads, closing: watch::Sender::new(false) })
     }
 
     /// Takes an order: joins the job that does it already, answers with the one that did it, or
@@ -203,7 +205,9 @@ impl<W: Work> Jobs<W> {
             }
             let there = board.job(&id);
             let stays = |job: &Job<W>| match job.ending() {
-                None | Some(Ending::Made | Ending::Infeasible(_)) => true,
+                None | Some(Ending::Infeasible(_)) => true,
+                // What it made can have expired since.
+                Some(Ending::Made) => is_made,
                 Some(Ending::Failed(_) | Ending::Cancelled) => is_repeated,
             };
             if let Some(job) = there.filter(|job| stays(job)) {
@@ -325,10 +329,16 @@ impl<W: Work> Jobs<W> {
     }
 
     /// Stops the threads, hands back what they were at so that the next start takes it up, and
-    /// lets nobody wait any longer. Blocks on the store.
-    pub(super) fn stop(&self) {
+    /// lets nobody wait any longer. Blocks on the store, and until the threads have let go of it
+    /// but no longer than `grace`.
+    pub(super) fn stop(&self, grace: Duration) {
+        const LOOK_EVERY: Duration = Duration::from_millis(5);
         self.closing.send_replace(true);
         self.inner.stop();
+        let until = Instant::now() + grace;
+        while self.threads.iter().any(|thread| !thread.is_finished()) && Instant::now() < until {
+            thread::sleep(LOOK_EVERY);
+        }
     }
 }
 

@@ -3,7 +3,6 @@
 use std::{
     collections::BTreeMap,
     sync::atomic::{AtomicUsize, Ordering},
-    thread,
 };
 
 use super::*;
@@ -186,13 +185,19 @@ async fn job_whose_product_is_there_is_done_at_once() {
     let f = fixture(LIMITS);
     f.stage.made.lock().unwrap().insert(1, vec![0]);
     assert_eq!(f.order(1, 1, None).unwrap().ending, Some(Ending::Made));
-    // Also if its node ended before it could write that down.
+    // Once it is gone it is made again.
+    f.stage.made.lock().unwrap().clear();
+    f.stage.let_go(1);
+    f.order(1, 1, None).unwrap();
+    assert_eq!(f.ended(1).await.ending, Some(Ending::Made));
+    assert_eq!(f.stage.begun(), [(1, 0)]);
+    // It is found also if its node ended before it could write that down.
     f.order(2, 1, None).unwrap();
-    f.until_begun(1);
+    f.until_begun(2);
     f.stage.made.lock().unwrap().insert(2, vec![0]);
     let f = f.reopened();
     assert_eq!(f.standing(2), Standing::Succeeded);
-    assert_eq!(f.stage.begun(), [(2, 0)]);
+    assert_eq!(f.stage.begun(), [(1, 0), (2, 0)]);
 }
 
 #[tokio::test]
@@ -298,7 +303,7 @@ async fn job_survives_its_node() {
     f.until_begun(4);
     assert_eq!(f.jobs.view(id(1)).unwrap().progress.attempts, 2);
     // Told to end: the attempt does not count.
-    f.jobs.stop();
+    f.jobs.stop(Duration::from_secs(30));
     assert_eq!(f.order(9, 1, None).unwrap_err().reason, "SHUTTING_DOWN");
     let f = f.reopened();
     f.stage.let_go(99);
@@ -372,7 +377,7 @@ async fn wait_ends_at_its_time_and_when_the_node_ends() {
     let late = Instant::now() + Duration::from_secs(600);
     let (waited, ()) = tokio::join!(f.jobs.wait(id(1), late), async {
         tokio::time::sleep(Duration::from_millis(10)).await;
-        f.jobs.stop();
+        f.jobs.stop(Duration::from_secs(30));
     });
     assert_eq!(waited.unwrap().ending, None);
 }

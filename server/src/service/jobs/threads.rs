@@ -5,7 +5,7 @@ use std::{
     io,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, atomic::Ordering},
-    thread,
+    thread::{self, JoinHandle},
     time::Instant,
 };
 
@@ -23,12 +23,12 @@ use crate::{
 };
 
 /// Starts the threads; they end when the board is closed.
-pub(super) fn start<W: Work>(inner: &Arc<Inner<W>>) -> io::Result<()> {
-    for number in 0..inner.limits.threads {
+pub(super) fn start<W: Work>(inner: &Arc<Inner<W>>) -> io::Result<Vec<JoinHandle<()>>> {
+    let start = |number| {
         let inner = Arc::clone(inner);
-        thread::Builder::new().name(format!("job-{number}")).spawn(move || inner.work())?;
-    }
-    Ok(())
+        thread::Builder::new().name(format!("job-{number}")).spawn(move || inner.work())
+    };
+    (0..inner.limits.threads).map(start).collect()
 }
 
 impl<W: Work> Inner<W> {
