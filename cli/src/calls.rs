@@ -1,4 +1,4 @@
-//! `vbar plan`, `vbar step`, `vbar precompute`, `vbar health`: one call, one answer as JSON.
+//! `vbar plan`, `vbar step`, `vbar health`: one call, one answer as JSON.
 
 use std::{
     fs::File,
@@ -51,13 +51,6 @@ pub(crate) struct StepArguments {
     node: NodeArguments,
 }
 
-/// Give a running node with --server: what a node of our own makes is gone when the command ends.
-#[derive(Debug, Args)]
-pub(crate) struct PrecomputeArguments {
-    #[command(flatten)]
-    mission: MissionArguments,
-}
-
 /// Made for the health check of a container.
 #[derive(Debug, Args)]
 pub(crate) struct HealthArguments {
@@ -79,6 +72,10 @@ pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
             let foreign = [("--initial", arguments.initial.is_some())];
             arguments.mission.refuse(foreign)?;
             return plans::plan(&mission, &arguments.mission.node, &arguments.options).await;
+        }
+        MissionFile::OfflineSampling(mission) => {
+            let name = &mission.name;
+            return Err(Failure::usage(format!("the mission {name} is flown step by step")));
         }
         MissionFile::VariableHorizon(mission) => arguments.mission.under_one_scheme(*mission)?,
     };
@@ -106,26 +103,6 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
     let request: StepRequest = json::parse(&read(&arguments.request)?)?;
     let session = Session::open(&arguments.node).await?;
     let answer = session.client.step(request).await;
-    session.close().await;
-    json::print(&json::render(&answer?)?)
-}
-
-pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
-    let problem = match arguments.mission.load()? {
-        MissionFile::AbortSafe(mission) => {
-            arguments.mission.refuse([])?;
-            mission.problem
-        }
-        MissionFile::DisturbanceFeedback(mission) => {
-            arguments.mission.refuse([])?;
-            mission.problem
-        }
-        MissionFile::VariableHorizon(mission) => {
-            arguments.mission.under_one_scheme(*mission)?.problem
-        }
-    };
-    let session = Session::open(&arguments.mission.node).await?;
-    let answer = session.client.precompute(problem).await;
     session.close().await;
     json::print(&json::render(&answer?)?)
 }

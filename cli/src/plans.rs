@@ -28,7 +28,7 @@ use crate::{
     failure::Failure,
     json,
     session::{NodeArguments, Session},
-    simulate::{Format, failure},
+    simulate::{Format, failure, tell},
 };
 
 /// Largest plan that is read.
@@ -276,10 +276,7 @@ fn tell_files(report: &PlanReport, folder: &Path) -> Result<(), Failure> {
     let path = folder.join(format!("{}_report.json", report.mission.name));
     write(&path, format!("{:#}\n", report.json()).as_bytes())?;
     written.push(path);
-    eprintln!("{} files in {}:", written.len(), folder.display());
-    for path in written {
-        eprintln!("  {}", path.display());
-    }
+    tell(&written, folder);
     Ok(())
 }
 

@@ -9,7 +9,7 @@ use clap::{Args, ValueEnum};
 use vbar_client::v1::HorizonSearch;
 use vbar_simulator::{
     AbortMission, AbortRunOptions, Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar,
-    Report, RunOptions, draw,
+    Report, RunOptions, SamplingMission, SamplingRunOptions, draw,
 };
 
 use crate::{
@@ -18,6 +18,7 @@ use crate::{
     json,
     mission::MissionArguments,
     plans::{self, ChangeArguments, FlightOptions},
+    sampling,
     session::Session,
 };
 
@@ -30,7 +31,7 @@ pub(crate) struct SimulateArguments {
     /// How the horizon is searched instead of the mission's own way
     #[arg(long, value_name = "SEARCH")]
     search: Option<Search>,
-    /// Number of runs [default: the mission's]
+    /// Number of runs, from each start where a mission names several [default: the mission's]
     #[arg(long, value_name = "N")]
     runs: Option<u32>,
     /// Start of every stream of chance: the same seed flies the same runs
@@ -104,6 +105,7 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
     let mission = match arguments.mission.load()? {
         MissionFile::AbortSafe(mission) => return fly_aborts(&mission, arguments).await,
         MissionFile::DisturbanceFeedback(mission) => return fly_plans(&mission, arguments).await,
+        MissionFile::OfflineSampling(mission) => return fly_sampling(&mission, arguments).await,
         MissionFile::VariableHorizon(mission) => *mission,
     };
     if let Some(name) = arguments.changes.given() {
@@ -165,6 +167,31 @@ async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Resul
     plans::fly(mission, &arguments.mission.node, options.changed(&arguments.changes)).await
 }
 
+/// Flies a mission under sampled chance constraints.
+async fn fly_sampling(
+    mission: &SamplingMission,
+    arguments: SimulateArguments,
+) -> Result<(), Failure> {
+    let scheme = arguments.mission.scheme()?;
+    let foreign = arguments.horizon_options().into_iter().find(|(_, given)| *given);
+    if let Some(name) = foreign.map(|(name, _)| name).or(arguments.changes.given()) {
+        return Err(Failure::usage(format!("{name} is not for this mission")));
+    }
+    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
+    let options = sampling::FlightOptions {
+        run: SamplingRunOptions {
+            scheme,
+            repetitions: arguments.runs,
+            seed: arguments.seed,
+            concurrency: arguments.concurrency,
+            variant: arguments.variant,
+        },
+        format: arguments.format,
+        out: (!arguments.no_pictures).then_some(folder),
+    };
+    sampling::fly(mission, &arguments.mission.node, options).await
+}
+
 fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
     let misalignment_deg = match arguments.misalignment_deg.as_deref() {
         None => None,
@@ -175,7 +202,7 @@ fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
         }
     };
     Ok(RunOptions {
-        scheme: arguments.mission.scheme,
+        scheme: arguments.mission.scheme()?,
         search: arguments.search.map(|search| match search {
             Search::Local => HorizonSearch::Local,
             Search::Enumeration => HorizonSearch::Enumeration,
@@ -194,11 +221,16 @@ fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
 fn tell_pictures(mission: &Mission, report: &Report, folder: &Path) -> Result<(), Failure> {
     let drawn = draw(mission, report, folder)
         .map_err(|fault| Failure::cannot_write(format!("{}: {fault}", folder.display())))?;
-    eprintln!("{} files in {}:", drawn.len(), folder.display());
-    for path in drawn {
+    tell(&drawn, folder);
+    Ok(())
+}
+
+/// Names what was written.
+pub(crate) fn tell(written: &[PathBuf], folder: &Path) {
+    eprintln!("{} files in {}:", written.len(), folder.display());
+    for path in written {
         eprintln!("  {}", path.display());
     }
-    Ok(())
 }
 
 pub(crate) fn failure(error: vbar_simulator::SimulationError) -> Failure {

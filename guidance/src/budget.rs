@@ -1,4 +1,4 @@
-//! Limits and interruption: how pure code learns that it should stop.
+//! Limits and interruption: how pure code learns that it should stop, and says how far it is.
 
 /// Why a computation was stopped from outside.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -9,6 +9,15 @@ pub enum Interruption {
     Cancelled,
 }
 
+/// How far a long computation is, in units of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Progress {
+    /// Units done; never falls within one phase.
+    pub done: usize,
+    /// Units of this phase, at least `done`.
+    pub total: usize,
+}
+
 /// Asked between units of work, about every ten microseconds, whether to go on.
 ///
 /// The question is a closure, because this crate has no clock: the server answers from its
@@ -16,16 +25,29 @@ pub enum Interruption {
 #[derive(Clone, Copy)]
 pub struct Budget<'a> {
     ask: Option<&'a (dyn Fn() -> Option<Interruption> + Sync)>,
+    tell: Option<&'a (dyn Fn(Progress) + Sync)>,
 }
 
 impl<'a> Budget<'a> {
     /// Never interrupts. Iteration limits still hold.
-    pub const UNLIMITED: Budget<'static> = Budget { ask: None };
+    pub const UNLIMITED: Budget<'static> = Budget { ask: None, tell: None };
 
     /// A budget that asks `ask`, which must be cheap.
     #[must_use]
     pub fn new(ask: &'a (dyn Fn() -> Option<Interruption> + Sync)) -> Self {
-        Self { ask: Some(ask) }
+        Self { ask: Some(ask), tell: None }
+    }
+
+    /// The same, and long computations tell `tell` how far they are, at most as often as they ask.
+    #[must_use]
+    pub fn telling(self, tell: &'a (dyn Fn(Progress) + Sync)) -> Self {
+        Self { tell: Some(tell), ..self }
+    }
+
+    /// The same for a part of the work whose progress means nothing to the caller.
+    #[must_use]
+    pub fn untold(self) -> Self {
+        Self { tell: None, ..self }
     }
 
     /// Fails when the computation should stop.
@@ -36,6 +58,13 @@ impl<'a> Budget<'a> {
         match self.ask.and_then(|ask| ask()) {
             None => Ok(()),
             Some(interruption) => Err(interruption),
+        }
+    }
+
+    /// Says how far the work is. Nothing that is computed may depend on it.
+    pub fn tell(&self, done: usize, total: usize) {
+        if let Some(tell) = self.tell {
+            tell(Progress { done, total });
         }
     }
 }

@@ -50,5 +50,5 @@ pub mod sampling;
 pub mod sets;
 pub mod units;
 
-pub use budget::{Budget, Interruption};
+pub use budget::{Budget, Interruption, Progress};
 pub use control::{Failure, Method};

@@ -6,9 +6,11 @@
 //!
 //! A mission file ([`MissionFile`]) says what the service is asked and against which truth it is
 //! flown. Closed loops ([`Mission`]) are flown by [`simulate`], plans ([`PlanMission`]) by
-//! [`fly_plans`], loops that can be aborted ([`AbortMission`]) by [`fly_aborts`], many runs at once;
-//! the [`Report`], [`PlanReport`] or [`AbortReport`] holds every trace, the statistics and the
-//! published figures; [`draw`], [`draw_plans`] and [`draw_aborts`] make pictures of it.
+//! [`fly_plans`], loops that can be aborted ([`AbortMission`]) by [`fly_aborts`], loops under
+//! sampled chance constraints ([`SamplingMission`]) by [`fly_sampling`], many runs at once; the
+//! [`Report`], [`PlanReport`], [`AbortReport`] or [`SamplingReport`] holds every trace, the
+//! statistics and the published figures; [`draw`], [`draw_plans`], [`draw_aborts`] and
+//! [`draw_sampling`] make pictures of it.
 
 mod campaign;
 mod clearance;
@@ -29,30 +31,45 @@ pub use campaign::{
         FlownBurn, OpenLoopEnd, PlanAnswer, PlanCampaign, PlanFlight, PlanRow, PlanRunOptions,
         PlanSample, Planned, compute_plan, compute_table, fly_plans,
     },
+    sampling::{
+        SamplingCampaign, SamplingFlight, SamplingOutcome, SamplingRunOptions, SamplingSample,
+        SamplingSchemeChoice, SamplingStep, fly_sampling,
+    },
     search::SearchComparison,
     simulate,
 };
 pub use mission::{
     AbortCase, AbortMission, AbortSources, Mission, MissionError, MissionFile, PlanChanges,
-    PlanMission, Published, PublishedAxes, RUNS_MAX, metric_name, metric_named,
+    PlanMission, Published, PublishedAxes, PublishedEffort, RUNS_MAX, SamplingMission, metric_name,
+    metric_named, sampling_scheme_name, sampling_scheme_named,
 };
-pub use pictures::{PictureError, abort::draw_aborts, draw, plan::draw_plans};
+pub use pictures::{
+    PictureError, abort::draw_aborts, draw, plan::draw_plans, sampling::draw_sampling,
+};
 pub use report::{
     Report, Statistics, Summary,
     abort::{
         AbortReport, AbortSummary, DriftFigures, FailureFigures, PathComparison, PhaseFigures,
     },
     plan::{PlanReport, PlanSummary, plan_rows_json, plan_rows_text, plan_text},
+    sampling::{SamplingReport, SamplingSummary},
 };
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{DVector, Vector3};
+    use nalgebra::{DMatrix, DVector, Vector3};
 
     /// The cases of one file of reference numbers (see `tests/golden/variable_horizon`).
     pub(crate) fn golden_cases(file: &str) -> Vec<serde_json::Value> {
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/variable_horizon");
-        let path = format!("{folder}/{file}");
+        match golden_file("variable_horizon", file) {
+            serde_json::Value::Array(cases) => cases,
+            other => panic!("{file} is not a list: {other}"),
+        }
+    }
+
+    /// One file of a family of reference numbers (see `tests/golden`).
+    pub(crate) fn golden_file(family: &str, file: &str) -> serde_json::Value {
+        let path = format!("{}/../tests/golden/{family}/{file}", env!("CARGO_MANIFEST_DIR"));
         let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
         serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
     }
@@ -63,6 +80,12 @@ mod tests {
         let path = format!("{folder}/{name}.json");
         let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
         serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
+    }
+
+    /// A list of rows.
+    pub(crate) fn matrix(json: &serde_json::Value) -> DMatrix<f64> {
+        let rows: Vec<_> = json.as_array().expect("rows").iter().map(vector).collect();
+        DMatrix::from_fn(rows.len(), rows[0].len(), |i, j| rows[i][j])
     }
 
     /// Every reference case of a spacecraft near a target with a constant spin.

@@ -1,6 +1,7 @@
 //! The methods: one folder each, one trait, one list.
 
 pub mod abort_safe;
+mod canonical;
 pub mod disturbance_feedback;
 pub mod offline_sampling;
 pub mod variable_horizon;
@@ -21,11 +22,14 @@ pub enum Method {
     DisturbanceFeedback,
     /// Rendezvous that can be aborted at every step.
     AbortSafe,
+    /// Stochastic MPC sampled offline, and its baselines.
+    OfflineSampling,
 }
 
 impl Method {
     /// Every method.
-    pub const ALL: [Self; 3] = [Self::VariableHorizon, Self::DisturbanceFeedback, Self::AbortSafe];
+    pub const ALL: [Self; 4] =
+        [Self::VariableHorizon, Self::DisturbanceFeedback, Self::AbortSafe, Self::OfflineSampling];
 
     /// Name on the wire and in identifiers.
     #[must_use]
@@ -34,6 +38,7 @@ impl Method {
             Self::VariableHorizon => "variable_horizon",
             Self::DisturbanceFeedback => "disturbance_feedback",
             Self::AbortSafe => "abort_safe",
+            Self::OfflineSampling => "offline_sampling",
         }
     }
 
@@ -44,13 +49,14 @@ impl Method {
             Self::VariableHorizon => variable_horizon::VERSION,
             Self::DisturbanceFeedback => disturbance_feedback::VERSION,
             Self::AbortSafe => abort_safe::VERSION,
+            Self::OfflineSampling => offline_sampling::VERSION,
         }
     }
 }
 
 /// Folders of methods whose mathematics stands here and that no node serves yet: contract, wire and
 /// missions are to come. A served method leaves this list for [`Method`]; `tidy` knows both.
-pub const NOT_YET_SERVED: [&str; 1] = ["offline_sampling"];
+pub const NOT_YET_SERVED: [&str; 0] = [];
 
 /// A method: think long once (`prepare` in shards, then `merge`), then decide fast many times.
 ///
@@ -83,13 +89,14 @@ pub trait Controller {
         budget: Budget<'_>,
     ) -> Result<Self::Shard, PrepareError>;
 
-    /// Puts shards, in their order, together.
+    /// Puts shards, in their order, together; this can be long work too.
     ///
     /// # Errors
     /// As [`Controller::run_shard`].
     fn merge(
         problem: &Self::Problem,
         shards: Vec<Self::Shard>,
+        budget: Budget<'_>,
     ) -> Result<Self::Artifact, PrepareError>;
 
     /// The state before the first step.

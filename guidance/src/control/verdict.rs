@@ -17,6 +17,10 @@ pub enum ConstraintFamily {
     EmptyInputSet,
     /// The tightened state set is empty.
     EmptyStateSet,
+    /// The set in which the state must lie after one step, so that every later step has an answer.
+    FirstStep,
+    /// The invariant tube around the nominal trajectory, in which the state must lie.
+    Tube,
 }
 
 /// What an answer claims about its cost.

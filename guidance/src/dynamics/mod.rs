@@ -8,6 +8,7 @@ mod poseidyn;
 mod scaling;
 mod transfer;
 mod two_body;
+mod uncertain_hill;
 mod uncertain_plant;
 mod yamanaka_ankersen;
 mod zero_order_hold;
@@ -22,6 +23,7 @@ pub use poseidyn::{PoseidynVariant, poseidyn};
 pub use scaling::HillScaling;
 pub use transfer::{Prediction, Transfer};
 pub use two_body::TwoBodyDrift;
+pub use uncertain_hill::uncertain_hill;
 pub use uncertain_plant::{
     Discretisation, MatrixPolynomial, Monomial, PlantMatrices, UncertainPlant, UncertainPlantError,
 };

@@ -157,6 +157,27 @@ impl HalfSpaces {
         products.iter().zip(&self.offsets).map(|(a, b)| a - b).fold(f64::NEG_INFINITY, f64::max)
     }
 
+    /// Every row moved towards `point`, to this share of its distance from it.
+    #[must_use]
+    pub fn towards(&self, point: &[f64], share: f64) -> Self {
+        let mut moved = Self::new(self.dimension());
+        for (normal, offset) in (0..self.len()).map(|row| (self.normal(row), self.offset(row))) {
+            let at: f64 = normal.iter().zip(point).map(|(a, z)| a * z).sum();
+            moved.push(normal, at + (offset - at) * share);
+        }
+        moved
+    }
+
+    /// Least distance of `point` to a row, per unit normal; negative outside, infinite without rows.
+    #[must_use]
+    pub fn room(&self, point: &[f64]) -> f64 {
+        let mut products = Vec::with_capacity(self.len());
+        self.rows.products(point, &mut products);
+        (0..self.len())
+            .map(|i| (self.offsets[i] - products[i]) * self.rows.scale(i))
+            .fold(f64::INFINITY, f64::min)
+    }
+
     /// A point with much room to every row: the centre of a large ball inside, of radius 1 if
     /// that fits, by a quadratic program that trades the radius against |x| only slightly.
     ///
@@ -198,11 +219,7 @@ impl HalfSpaces {
         }
         let point = solution.point[..n].to_vec();
         // The room is measured, not believed.
-        let mut products = Vec::with_capacity(self.len());
-        self.rows.products(&point, &mut products);
-        let room = (0..self.len())
-            .map(|i| (self.offsets[i] - products[i]) * self.rows.scale(i))
-            .fold(ROOM_WANTED, f64::min);
+        let room = self.room(&point).min(ROOM_WANTED);
         Ok(InteriorPoint { point, room })
     }
 

@@ -6,6 +6,7 @@ mod clearance;
 mod dominance;
 mod elimination;
 mod ellipsoids;
+mod extremes;
 mod flight;
 mod growth;
 mod half_spaces;
@@ -22,6 +23,7 @@ pub use abort::{Abort, AbortQuestion, AbortVerdict, find_abort};
 pub use clearance::Outside;
 pub use elimination::{EliminationError, project_out_last};
 pub use ellipsoids::{EllipsoidUnion, NearEllipsoid};
+pub use extremes::{ExtremeCheck, check_extremes};
 pub use flight::{Closest, Flight};
 pub use growth::{Growth, GrowthError, GrowthLimits, grow_control_invariant};
 pub use half_spaces::{HalfSpaces, InteriorPoint, NoInterior};
@@ -32,9 +34,9 @@ pub use invariant::{
 pub(crate) use passive::passive_safety_along;
 pub use passive::{DriftVerdict, PassiveQuestion, PassiveVerdict, passive_safety};
 pub use polytopes::{PolytopeQuestion, PolytopeUnion, ReachablePolytope};
-pub use redundancy::{EXACT, Reduction, irredundant};
+pub use redundancy::{EXACT, Reduction, irredundant, irredundant_about};
 pub use sampled_constraints::{StageConstraints, StageFamily, StageGroup};
-pub use scenario::{SampledRows, Scenario};
+pub use scenario::{Context, GroupPart, SampledRows, Scenario, Survivors};
 pub use separation::{
     Cut, cut_off_ellipsoid, cut_off_ellipsoids, cut_off_polytope, cut_off_polytopes,
 };

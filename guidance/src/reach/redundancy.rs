@@ -54,14 +54,8 @@ impl Reduction {
     /// every point satisfies the removed rows too.
     #[must_use]
     pub fn inner(&self, candidates: &HalfSpaces) -> HalfSpaces {
-        let mut inner = HalfSpaces::new(candidates.dimension());
-        for &row in &self.kept {
-            let normal = candidates.normal(row);
-            let at: f64 = normal.iter().zip(&self.interior.point).map(|(a, z)| a * z).sum();
-            let room = candidates.offset(row) - at;
-            inner.push(normal, at + room / (1.0 + self.outer_excess));
-        }
-        inner
+        let kept = candidates.select(&self.kept);
+        kept.towards(&self.interior.point, 1.0 / (1.0 + self.outer_excess))
     }
 }
 
@@ -81,14 +75,47 @@ pub fn irredundant(
     let mut all = candidates.clone();
     all.extend(context);
     let interior = all.interior_point(budget)?;
-    let mut search = Search::new(&all, candidates.len(), &interior, tolerance)?;
-    if !context.is_empty() && candidates.len() > DOMINANCE_WORTHWHILE {
+    reduce(candidates.len(), &all, interior, tolerance, budget)
+}
+
+/// [`irredundant`], with rows measured about a point of the caller. Reductions about the same
+/// point add up: what one removes within 1 + epsilon and the next within 1 + epsilon' of what the
+/// first had left holds within (1 + epsilon)(1 + epsilon').
+///
+/// # Errors
+/// [`NoInterior::Numerical`] if the point does not lie inside all rows.
+pub fn irredundant_about(
+    point: &InteriorPoint,
+    candidates: &HalfSpaces,
+    context: &HalfSpaces,
+    tolerance: f64,
+    budget: Budget<'_>,
+) -> Result<Reduction, NoInterior> {
+    let mut all = candidates.clone();
+    all.extend(context);
+    if !(all.room(&point.point) > 0.0) {
+        return Err(NoInterior::Numerical);
+    }
+    reduce(candidates.len(), &all, point.clone(), tolerance, budget)
+}
+
+/// The first `candidates` rows are to be decided, the others stay.
+fn reduce(
+    candidates: usize,
+    all: &HalfSpaces,
+    interior: InteriorPoint,
+    tolerance: f64,
+    budget: Budget<'_>,
+) -> Result<Reduction, NoInterior> {
+    let mut search = Search::new(all, candidates, &interior, tolerance)?;
+    if candidates < all.len() && candidates > DOMINANCE_WORTHWHILE {
         // Only rows that stay may carry the box, or rows could remove each other.
         search.dominance = Dominance::new(&search.context_rows(), budget)?;
     }
-    for row in 0..candidates.len() {
+    for row in 0..candidates {
         if row % BUDGET_PERIOD == 0 {
             budget.check()?;
+            budget.tell(row, candidates);
         }
         if search.fate[row] == Fate::Open {
             search.decide(row);
@@ -97,7 +124,7 @@ pub fn irredundant(
     if search.ties {
         search.clean_up(budget)?;
     }
-    let kept = (0..candidates.len()).filter(|&row| search.fate[row] == Fate::Needed).collect();
+    let kept = (0..candidates).filter(|&row| search.fate[row] == Fate::Needed).collect();
     Ok(Reduction { kept, interior, outer_excess: search.outer_excess, doubtful: search.doubtful })
 }
 
@@ -127,6 +154,44 @@ struct Search {
     active: ActiveSet,
     padded: Vec<f64>,
     reversed: Vec<f64>,
+}
+
+/// Every row times the matrix: M a_i.
+fn mapped(rows: &DenseRows, matrix: &DMatrix<f64>) -> DenseRows {
+    let by_rows = DenseRows::from_matrix(matrix);
+    let mut image = DenseRows::new(matrix.nrows());
+    let mut normal = Vec::with_capacity(matrix.nrows());
+    for row in 0..rows.len() {
+        by_rows.products(rows.normal(row), &mut normal);
+        image.push(&normal);
+    }
+    image
+}
+
+/// Orthonormal axes, one a row, along which rows differ from the multiple of the row before that
+/// is nearest to them.
+fn axes_of_differences(rows: &DenseRows, candidates: usize) -> DMatrix<f64> {
+    let n = rows.columns();
+    let mut spread = DMatrix::<f64>::zeros(n, n);
+    let mut rest = vec![0.0; n];
+    for row in 1..candidates {
+        let (before, this) = (rows.normal(row - 1), rows.normal(row));
+        let square: f64 = before.iter().map(|a| a * a).sum();
+        let along: f64 = before.iter().zip(this).map(|(a, b)| a * b).sum();
+        // The first row of another bundle says nothing about differences within one.
+        if !(along * along > 0.5 * square * this.iter().map(|a| a * a).sum::<f64>()) {
+            continue;
+        }
+        let pairs = this.iter().zip(before);
+        rest.iter_mut().zip(pairs).for_each(|(r, (a, b))| *r = a - along / square * b);
+        for i in 0..n {
+            for j in 0..n {
+                spread[(i, j)] += rest[i] * rest[j];
+            }
+        }
+    }
+    let axes = spread.symmetric_eigen().eigenvectors.transpose();
+    if axes.iter().all(|x| x.is_finite()) { axes } else { DMatrix::identity(n, n) }
 }
 
 /// How a feasibility program ended.
@@ -166,14 +231,11 @@ impl Search {
         let floor = 1e-9 * moments.trace().max(f64::MIN_POSITIVE) / n as f64;
         let metric = QuadraticCost::new(moments + DMatrix::identity(n, n) * floor)
             .map_err(|_| NoInterior::Numerical)?;
-        let mut round = DenseRows::new(n);
-        for row in 0..polar.len() {
-            let a = polar.normal(row);
-            for (k, component) in normal.iter_mut().enumerate() {
-                *component = metric.factor_column(k).iter().zip(a).map(|(j, a)| j * a).sum();
-            }
-            round.push(&normal);
-        }
+        let whiten = DMatrix::from_fn(n, n, |k, i| metric.factor_column(k)[i]);
+        let round = mapped(&polar, &whiten);
+        // Turned so that neighbours differ along few axes: then a box along the axes is tight for
+        // what they differ by.
+        let round = mapped(&round, &axes_of_differences(&round, candidates));
         Ok(Self {
             fate: vec![Fate::Open; candidates],
             needed: (candidates..all.len()).collect(),
@@ -206,7 +268,10 @@ impl Search {
             self.fate[row] = Fate::Removed;
             return;
         }
-        if self.dominance.as_mut().is_some_and(|front| front.dominated(&self.polar, row)) {
+        let Self { dominance, polar, tolerance, .. } = self;
+        let behind = dominance.as_mut().and_then(|front| front.excess(polar, row, *tolerance));
+        if let Some(excess) = behind {
+            self.outer_excess = self.outer_excess.max(excess);
             self.fate[row] = Fate::Removed;
             return;
         }
@@ -225,7 +290,7 @@ impl Search {
                     self.needed.push(worst);
                     self.touch(worst);
                     if let Some(front) = &mut self.dominance {
-                        front.add(worst);
+                        front.add(&self.polar, worst);
                     }
                 }
             }
@@ -257,8 +322,36 @@ impl Search {
             if !self.active.point().iter().all(|y| y.is_finite()) {
                 return Outcome::Doubtful;
             }
+            if let Some(excess) = self.proved_by_the_box(row) {
+                self.outer_excess = self.outer_excess.max(excess);
+                return Outcome::Redundant;
+            }
         }
         Outcome::Open
+    }
+
+    /// Before the search ends: the active rows combine to nearly a_row, and what is missing is
+    /// bounded by the box. The point itself says what is missing, times the row's own weight; what
+    /// counts is computed again from the rows.
+    fn proved_by_the_box(&self, row: usize) -> Option<f64> {
+        let dominance = self.dominance.as_ref()?;
+        let (mut own, mut sum) = (0.0, 0.0);
+        for (other, weight) in self.active.active() {
+            if other == row { own = weight } else { sum += weight }
+        }
+        let enough = |reach: f64| own > 0.0 && sum / own + reach <= 1.0 + self.tolerance;
+        if !enough(dominance.reach(self.active.point()) / own) {
+            return None;
+        }
+        let mut rest = self.polar.normal(row).to_vec();
+        for (other, weight) in self.active.active().filter(|&(other, _)| other != row) {
+            let share = weight.max(0.0) / own;
+            for (r, a) in rest.iter_mut().zip(self.polar.normal(other)) {
+                *r -= share * a;
+            }
+        }
+        let reach = dominance.reach(&rest);
+        enough(reach).then(|| (sum / own + reach - 1.0).max(0.0))
     }
 
     /// The most violated row, among recent ones if there is any, else among all needed ones.

@@ -74,12 +74,18 @@ impl StageConstraints {
         }
     }
 
-    /// Appends the rows of `group` for one sample to `rows`, which are over (x_0, v_0 .. v_{T-1}):
-    /// H M z <= h - H c with x_l = M z + c. [Mammarella2019, eqs. 9-12]
+    /// Appends these faces of `group` for one sample to `rows`, which are over (x_0, v_0 ..
+    /// v_{T-1}): H M z <= h - H c with x_l = M z + c. [Mammarella2019, eqs. 9-12]
     ///
     /// # Panics
-    /// If the prediction is shorter than [`StageGroup::steps`].
-    pub fn push_rows(&self, group: StageGroup, prediction: &Prediction, rows: &mut HalfSpaces) {
+    /// If the prediction is shorter than [`StageGroup::steps`], or a face is none of the group's.
+    pub fn push_rows(
+        &self,
+        group: StageGroup,
+        faces: &[usize],
+        prediction: &Prediction,
+        rows: &mut HalfSpaces,
+    ) {
         let predicted: &DMatrix<f64> = match group.family {
             StageFamily::Input => &prediction.inputs[group.stage],
             StageFamily::State | StageFamily::Terminal => &prediction.states[group.stage],
@@ -87,7 +93,7 @@ impl StageConstraints {
         let constraints = self.of(group.family);
         let width = predicted.ncols() - 1;
         let mut normal = vec![0.0; width];
-        for row in 0..constraints.len() {
+        for &row in faces {
             let h = constraints.normal(row);
             let along = |column: usize| -> f64 {
                 h.iter().enumerate().map(|(k, h)| h * predicted[(k, column)]).sum()

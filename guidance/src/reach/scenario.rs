@@ -1,14 +1,14 @@
-//! A scenario program made small: sampled rows, group by group, without those that do not matter.
+//! A scenario program made small: sampled rows, part by part, without those that do not matter.
 //!
-//! The groups are independent: [`Scenario::survivors`] of one needs nothing of the others but a
-//! small context that every group can make for itself. So groups are shards, and
-//! [`Scenario::merged`] of their survivors, in group order, is the same on any machine.
+//! The parts are independent: [`Scenario::survivors`] of one needs nothing of the others but a
+//! small context that every part can make for itself. So parts are shards, and
+//! [`Scenario::merged`] of their survivors, in order, is the same on any machine.
 
 use nalgebra::DMatrix;
 
 use super::{
-    EXACT, HalfSpaces, NoInterior, Reduction, StageConstraints, StageFamily, StageGroup,
-    irredundant,
+    EXACT, ExtremeCheck, HalfSpaces, InteriorPoint, NoInterior, Reduction, StageConstraints,
+    StageFamily, StageGroup, check_extremes, irredundant, irredundant_about,
 };
 use crate::{
     budget::{Budget, Interruption},
@@ -16,10 +16,17 @@ use crate::{
     sampling::{ScalarLaw, Stream},
 };
 
-/// Samples of every group that make the context.
-const CONTEXT_SAMPLES: usize = 24;
+/// Samples of every group that the context is chosen from.
+const CONTEXT_SAMPLES: usize = 12;
+/// Rows that cut off less than this are not chosen: any choice would do, and a small one is fast.
+const CONTEXT_TOLERANCE: f64 = 0.05;
 /// Samples between two looks at the budget.
-const BUDGET_PERIOD: usize = 256;
+const BUDGET_PERIOD: usize = 64;
+/// Share of the terminal set's inner point in the point that rows are measured about: whatever is
+/// sampled leaves room there, because the terminal set is invariant without corrections.
+const TERMINAL_SHARE: f64 = 0.2;
+/// Extreme points at which the removed rows of a part, or of all parts, are looked at.
+const CHECKED_POINTS: usize = 48;
 
 /// What is sampled.
 #[derive(Debug, Clone, Copy)]
@@ -66,6 +73,77 @@ impl SampledRows {
     }
 }
 
+/// Some constraints of a group: every `stride`-th face, from `first`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GroupPart {
+    /// Index of the group.
+    pub group: usize,
+    /// The first face.
+    pub first: usize,
+    /// From a face to the next.
+    pub stride: usize,
+}
+
+impl GroupPart {
+    /// All faces of a group.
+    #[must_use]
+    pub fn whole(group: usize) -> Self {
+        Self { group, first: 0, stride: 1 }
+    }
+}
+
+/// What stays in every reduction.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Context {
+    /// Some rows of the first few samples of every group.
+    pub rows: SampledRows,
+    /// The point that rows are measured about.
+    pub centre: InteriorPoint,
+}
+
+/// What is left of a part, or of all.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Survivors {
+    /// The rows, as they were sampled.
+    pub rows: SampledRows,
+    /// Every removed row holds within 1 + this wherever these rows and the context hold, measured
+    /// about the context's centre.
+    pub outer_excess: f64,
+    /// Rows kept because no certificate for their removal was accepted.
+    pub doubtful: usize,
+    /// Removed rows at extreme points of what is left.
+    pub check: ExtremeCheck,
+}
+
+impl Survivors {
+    fn new(
+        reduction: &Reduction,
+        candidates: &HalfSpaces,
+        context: &HalfSpaces,
+        groups: impl Fn(usize) -> usize,
+        budget: Budget<'_>,
+    ) -> Result<Self, NoInterior> {
+        let rows = candidates.select(&reduction.kept);
+        let mut left = rows.clone();
+        left.extend(context);
+        let centre = &reduction.interior;
+        let check = check_extremes(&left, candidates, centre, CHECKED_POINTS, budget)?;
+        Ok(Self {
+            rows: SampledRows { rows, groups: reduction.kept.iter().map(|&i| groups(i)).collect() },
+            outer_excess: reduction.outer_excess,
+            doubtful: reduction.doubtful,
+            check,
+        })
+    }
+
+    /// The rows, moved towards `centre` by 1 / (1 + the excess): an inner set, whose every point
+    /// satisfies the removed rows too.
+    #[must_use]
+    pub fn inner(&self, centre: &InteriorPoint) -> HalfSpaces {
+        self.rows.rows.towards(&centre.point, 1.0 / (1.0 + self.outer_excess))
+    }
+}
+
 impl Scenario<'_> {
     /// The prediction of sample `sample`, over `steps` steps; `stream` is the index of a group, or
     /// any other number for samples apart from those of the groups.
@@ -81,7 +159,7 @@ impl Scenario<'_> {
         Prediction::new(&matrices, &disturbances, self.gain, self.horizon)
     }
 
-    /// Rows of group `group` for these samples, over (x, v_0 .. v_{T-1}).
+    /// Rows of a part for these samples, over (x, v_0 .. v_{T-1}).
     ///
     /// The input of stage 0 is K x + v_0 whatever the sample: one is enough.
     ///
@@ -89,93 +167,133 @@ impl Scenario<'_> {
     /// The [`Interruption`] of the budget.
     pub fn rows(
         &self,
-        group: usize,
+        part: GroupPart,
         samples: std::ops::Range<usize>,
         budget: Budget<'_>,
     ) -> Result<HalfSpaces, Interruption> {
-        let stage_group = self.groups[group];
+        let stage_group = self.groups[part.group];
         let certain = stage_group == StageGroup { family: StageFamily::Input, stage: 0 };
+        let faces = self.constraints.of(stage_group.family).len();
+        let chosen: Vec<usize> = (part.first..faces).step_by(part.stride.max(1)).collect();
         let (m, n) = self.gain.shape();
         let mut rows = HalfSpaces::new(n + self.horizon * m);
         for sample in samples.take(if certain { 1 } else { usize::MAX }) {
             if sample % BUDGET_PERIOD == 0 {
                 budget.check()?;
             }
-            let prediction = self.prediction(group as u64, sample, stage_group.steps());
-            self.constraints.push_rows(stage_group, &prediction, &mut rows);
+            let prediction = self.prediction(part.group as u64, sample, stage_group.steps());
+            self.constraints.push_rows(stage_group, &chosen, &prediction, &mut rows);
         }
         // All samples of one constraint, then of the next: neighbours are nearly parallel, and a
         // row that lies behind another is found at once.
-        let faces = self.constraints.of(stage_group.family).len();
+        let count = chosen.len().max(1);
         let order: Vec<usize> =
-            (0..faces).flat_map(|face| (face..rows.len()).step_by(faces)).collect();
+            (0..count).flat_map(|face| (face..rows.len()).step_by(count)).collect();
         Ok(rows.select(&order))
     }
 
     /// Rows of all groups, had none been removed.
     #[must_use]
     pub fn row_count(&self) -> usize {
-        let rows = |(group, size): (&StageGroup, &usize)| {
-            let certain = group.family == StageFamily::Input && group.stage == 0;
-            self.constraints.of(group.family).len() * if certain { 1 } else { *size }
-        };
-        self.groups.iter().zip(self.sizes).map(rows).sum()
+        (0..self.groups.len()).map(|group| self.group_row_count(group)).sum()
     }
 
-    /// The needed rows among the first few samples of every group. They stay in every reduction,
-    /// so that a group sees what the others do to the set.
+    /// Rows of a group, had none been removed.
+    #[must_use]
+    pub fn group_row_count(&self, group: usize) -> usize {
+        let StageGroup { family, stage } = self.groups[group];
+        let certain = family == StageFamily::Input && stage == 0;
+        self.constraints.of(family).len() * if certain { 1 } else { self.sizes[group] }
+    }
+
+    /// The rows that matter most among the first few samples of every group. They stay in every
+    /// part's reduction, so that it sees what the others do to the set.
     ///
     /// # Errors
     /// [`NoInterior`]: the sampled set is empty or flat already.
-    pub fn context(&self, budget: Budget<'_>) -> Result<SampledRows, NoInterior> {
+    pub fn context(&self, budget: Budget<'_>) -> Result<Context, NoInterior> {
         let (m, n) = self.gain.shape();
         let none = HalfSpaces::new(n + self.horizon * m);
         let mut all = SampledRows { rows: none.clone(), groups: Vec::new() };
         for group in 0..self.groups.len() {
-            let rows = self.rows(group, 0..CONTEXT_SAMPLES.min(self.sizes[group]), budget)?;
+            let first = 0..CONTEXT_SAMPLES.min(self.sizes[group]);
+            let rows = self.rows(GroupPart::whole(group), first, budget)?;
             all.extend(&rows, std::iter::repeat_n(group, rows.len()));
         }
-        let kept = irredundant(&all.rows, &none, EXACT, budget)?.kept;
-        Ok(all.select(&kept))
+        let reduction = irredundant(&all.rows, &none, CONTEXT_TOLERANCE, budget)?;
+        let inside = self.constraints.terminal.interior_point(budget)?;
+        let inside = inside.point.into_iter().chain(std::iter::repeat(0.0));
+        let point: Vec<f64> = (reduction.interior.point.iter().zip(inside))
+            .map(|(ball, terminal)| ball + TERMINAL_SHARE * (terminal - ball))
+            .collect();
+        let rows = all.select(&reduction.kept);
+        let room = rows.rows.room(&point);
+        Ok(Context { rows, centre: InteriorPoint { point, room } })
     }
 
-    /// The rows of a group that are needed beside the context.
+    /// The rows of a part that are needed beside the context; `tolerance` as in [`irredundant`].
     ///
     /// # Errors
     /// [`NoInterior`].
     pub fn survivors(
         &self,
-        group: usize,
-        context: &SampledRows,
+        part: GroupPart,
+        context: &Context,
+        tolerance: f64,
         budget: Budget<'_>,
-    ) -> Result<SampledRows, NoInterior> {
-        let first = CONTEXT_SAMPLES.min(self.sizes[group]);
-        let rows = self.rows(group, first..self.sizes[group], budget)?;
-        let kept = irredundant(&rows, &context.rows, EXACT, budget)?.kept;
-        Ok(SampledRows { rows: rows.select(&kept), groups: vec![group; kept.len()] })
+    ) -> Result<Survivors, NoInterior> {
+        let rows = self.rows(part, 0..self.sizes[part.group], budget)?;
+        let rows = nearest_first(&rows, self.sizes[part.group], &context.centre);
+        let beside = &context.rows.rows;
+        let reduction = irredundant_about(&context.centre, &rows, beside, tolerance, budget)?;
+        Survivors::new(&reduction, &rows, beside, |_| part.group, budget)
     }
 
-    /// All survivors, in group order, and the context, reduced together; `tolerance` as in
-    /// [`irredundant`].
+    /// All survivors, in order, and the context, reduced together by `tolerance`: the excess of the
+    /// result holds for every row that was sampled.
     ///
     /// # Errors
     /// [`NoInterior`].
     pub fn merged(
-        context: &SampledRows,
-        survivors: &[SampledRows],
+        context: &Context,
+        parts: &[Survivors],
         tolerance: f64,
         budget: Budget<'_>,
-    ) -> Result<(SampledRows, Reduction), NoInterior> {
-        let mut all = context.clone();
-        for part in survivors {
-            all.extend(&part.rows, part.groups.iter().copied());
+    ) -> Result<Survivors, NoInterior> {
+        let mut all = context.rows.select(&[]);
+        for part in parts {
+            all.extend(&part.rows.rows, part.rows.groups.iter().copied());
         }
-        let none = HalfSpaces::new(all.rows.dimension());
-        let reduction = irredundant(&all.rows, &none, tolerance, budget)?;
-        let mut kept = all.select(&reduction.kept);
-        if tolerance > EXACT {
-            kept.rows = reduction.inner(&all.rows);
-        }
-        Ok((kept, reduction))
+        let groups = |index| all.groups[index];
+        let (centre, beside) = (&context.centre, &context.rows.rows);
+        let reduction = irredundant_about(centre, &all.rows, beside, tolerance, budget)?;
+        let mut merged = Survivors::new(&reduction, &all.rows, beside, groups, budget)?;
+        // What the context was needed for is over: rows of it that are not needed go.
+        let left = &merged.rows.rows;
+        let reduction = irredundant_about(centre, beside, left, EXACT, budget.untold())?;
+        let kept = context.rows.select(&reduction.kept);
+        merged.rows.extend(&kept.rows, kept.groups);
+        merged.doubtful += reduction.doubtful;
+        merged.outer_excess = (1.0 + merged.outer_excess) * (1.0 + reduction.outer_excess) - 1.0;
+        let before = parts.iter().map(|part| part.outer_excess).fold(0.0, f64::max);
+        Ok(Survivors {
+            // What is left of the parts holds within one factor, what they removed within both.
+            outer_excess: (1.0 + before) * (1.0 + merged.outer_excess) - 1.0,
+            doubtful: parts.iter().map(|part| part.doubtful).sum::<usize>() + merged.doubtful,
+            check: parts.iter().fold(merged.check, |check, part| check.and(part.check)),
+            ..merged
+        })
     }
+}
+
+/// Bundles of `size` rows each, those nearest to the point first: later ones lie behind them.
+fn nearest_first(rows: &HalfSpaces, size: usize, about: &InteriorPoint) -> HalfSpaces {
+    let mut products = Vec::with_capacity(rows.len());
+    rows.rows().products(&about.point, &mut products);
+    let distance = |row: usize| (rows.offset(row) - products[row]) * rows.rows().scale(row);
+    let mut order: Vec<usize> = (0..rows.len()).collect();
+    for bundle in order.chunks_mut(size.max(1)) {
+        bundle.sort_by(|&a, &b| distance(a).total_cmp(&distance(b)).then(a.cmp(&b)));
+    }
+    rows.select(&order)
 }

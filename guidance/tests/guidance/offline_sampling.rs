@@ -6,77 +6,19 @@ use rand_chacha::ChaCha8Rng;
 use vbar_guidance::{
     Budget,
     control::{
-        Claim, Controller, PrepareError, StepError,
+        Claim, ConstraintFamily, Controller, PrepareError, StepError,
         offline_sampling::{
-            Artifact, Branch, CostWeights, GainChoice, Measurement, OfflineSampling, Problem,
-            Redundancy, SampleChoice, State, Step, Verdict,
+            Artifact, Branch, GainChoice, Measurement, OfflineSampling, Redundancy, RowOrigin,
+            State, Verdict,
         },
     },
-    dynamics::{Discretisation, MatrixPolynomial, UncertainPlant},
-    reach::{GrowthLimits, InvariantLimits},
+    dynamics::Discretisation,
     sampling::ScalarLaw,
     sets::Polytope,
+    units::Seconds,
 };
 
-const DISTURBANCE: f64 = 0.02;
-
-fn symmetric(sizes: &[f64]) -> Polytope {
-    let n = sizes.len();
-    let normals = DMatrix::from_fn(2 * n, n, |i, j| match i % n == j {
-        true if i < n => 1.0,
-        true => -1.0,
-        false => 0.0,
-    });
-    Polytope::new(normals, DVector::from_fn(2 * n, |i, _| sizes[i % n]))
-}
-
-fn problem() -> Problem {
-    let column = DMatrix::from_row_slice(2, 1, &[0.5, 1.0]);
-    let plant = UncertainPlant {
-        a: MatrixPolynomial::constant(DMatrix::from_row_slice(2, 2, &[1.0, 1.0, 0.0, 1.0])),
-        b: MatrixPolynomial::constant(column.clone()).with_linear(0, column),
-        b_w: MatrixPolynomial::constant(DMatrix::identity(2, 2)),
-        parameters: vec![ScalarLaw::Uniform { low: -0.1, high: 0.1 }],
-        discretisation: Discretisation::None,
-    };
-    let identity = DMatrix::identity(2, 2);
-    let half = DMatrix::from_element(1, 1, 0.5);
-    Problem {
-        plant,
-        vertices: None,
-        disturbance: vec![ScalarLaw::Uniform { low: -DISTURBANCE, high: DISTURBANCE }; 2],
-        horizon: 5,
-        gain: GainChoice::Lqr { state: identity.clone(), input: half.clone() },
-        weights: CostWeights { state: identity, input: half, samples: 200 },
-        state_set: symmetric(&[4.0, 1.5]),
-        input_set: symmetric(&[1.0]),
-        samples: SampleChoice {
-            violation: 0.05,
-            confidence_complement: 1e-3,
-            variables: None,
-            size: Some(400),
-            state_at_start: false,
-        },
-        redundancy: Redundancy::Exact,
-        terminal_limits: InvariantLimits { iterations_max: 100, rows_max: 500 },
-        growth: GrowthLimits { rounds: 20, directions: 40, facets_max: 300 },
-        seed: 11,
-    }
-}
-
-fn prepare(problem: &Problem) -> Result<Artifact, PrepareError> {
-    let run = |shard| OfflineSampling::run_shard(problem, shard, Budget::UNLIMITED);
-    // In reverse, because the order of computing must not matter, only that of merging.
-    let count = OfflineSampling::shards(problem);
-    let mut shards = (0..count).rev().map(run).collect::<Result<Vec<_>, _>>()?;
-    shards.reverse();
-    OfflineSampling::merge(problem, shards)
-}
-
-fn step(artifact: &Artifact, state: &State, x: &DVector<f64>) -> Step {
-    let measurement = Measurement { state: x.clone() };
-    OfflineSampling::step(artifact, state, &measurement, Budget::UNLIMITED).unwrap()
-}
+use crate::double_integrator::{DISTURBANCE, prepare, problem, step};
 
 #[test]
 fn offline_sampling_keeps_every_promise_in_closed_loop() {
@@ -90,7 +32,7 @@ fn offline_sampling_keeps_every_promise_in_closed_loop() {
     while flown < 20 {
         let x =
             DVector::from_vec(vec![chance.random_range(-4.0..4.0), chance.random_range(-1.5..1.5)]);
-        if artifact.first_step_set().violation(x.as_slice()) > -1e-6 {
+        if artifact.first_step_set().unwrap().violation(x.as_slice()) > -1e-6 {
             continue;
         }
         flown += 1;
@@ -108,7 +50,7 @@ fn offline_sampling_keeps_every_promise_in_closed_loop() {
             let w = DVector::from_fn(2, |_, _| chance.random_range(-DISTURBANCE..DISTURBANCE));
             x = &plant.a * &x + &plant.b * &command.input + w;
             // What was proved: the successor lies in the first-step set.
-            assert!(artifact.first_step_set().violation(x.as_slice()) <= 1e-7, "step {k}");
+            assert!(artifact.first_step_set().unwrap().violation(x.as_slice()) <= 1e-7, "step {k}");
             state = State::from_bytes(&step.next.to_bytes()).unwrap();
             assert_eq!(state, step.next);
         }
@@ -158,19 +100,94 @@ fn offline_sampling_refuses_what_does_not_fit() {
     let mut wrong = problem();
     wrong.weights.input = DMatrix::identity(2, 2);
     wrong.samples.violation = 0.2;
+    wrong.samples.confidence_complement = 0.0;
     let Err(PrepareError::Faults(faults)) = prepare(&wrong) else { panic!("accepted") };
     let fields: Vec<&str> = faults.iter().map(|fault| fault.field.as_str()).collect();
-    assert_eq!(fields, ["weights.input", "samples"]);
+    assert_eq!(fields, ["weights.input", "samples.violation", "samples.confidence_complement"]);
 
-    let mut rough = problem();
-    rough.disturbance = vec![ScalarLaw::Uniform { low: -3.0, high: 3.0 }; 2];
-    assert!(matches!(prepare(&rough), Err(PrepareError::Infeasible(_))));
+    let mut many = problem();
+    many.samples.rows_max = 10_000;
+    let Err(PrepareError::Faults(faults)) = prepare(&many) else { panic!("accepted") };
+    assert_eq!(faults[0].field, "samples.rows_max");
+    assert!(faults[0].got.ends_with(" rows") && faults[0].expected == "at most 10000 rows");
+
+    // Stable where the input has an effect, not where it may have none.
+    let mut weak = problem();
+    weak.plant.parameters = vec![ScalarLaw::Uniform { low: -1.0, high: 0.1 }];
+    weak.gain = GainChoice::Explicit(DMatrix::from_row_slice(1, 2, &[-0.4, -1.1]));
+    let Err(PrepareError::Faults(faults)) = prepare(&weak) else { panic!("accepted") };
+    assert_eq!(faults.len(), 1, "{faults:?}");
+    assert!(faults[0].field == "gain" && faults[0].got.contains("vertex 0 of 2"), "{faults:?}");
 
     let artifact = prepare(&problem()).unwrap();
-    let short = Measurement { state: DVector::zeros(1) };
+    let short = Measurement { state: DVector::zeros(1), elapsed: None };
     let start = OfflineSampling::start(&artifact);
     let refused = OfflineSampling::step(&artifact, &start, &short, Budget::UNLIMITED);
     assert!(matches!(refused, Err(StepError::Measurement(_))), "{refused:?}");
+}
+
+#[test]
+fn offline_sampling_without_a_terminal_set_says_how_far_the_target_must_move() {
+    // The target lies on the constraint -x <= 0, where no disturbance can be borne.
+    let mut blunt = problem();
+    let mut offsets = blunt.state_set.offsets().clone();
+    offsets[2] = 0.0;
+    blunt.state_set = Polytope::new(blunt.state_set.normals().clone(), offsets.clone());
+    let Err(PrepareError::Infeasible(why)) = prepare(&blunt) else { panic!("accepted") };
+    assert!(why.reason.contains("row 2 of state_set"), "{}", why.reason);
+    let [relaxation] = why.relaxations[..] else { panic!("{why:?}") };
+    assert_eq!(relaxation.family, ConstraintFamily::State);
+    // A little more than what was said leaves room, nine tenths of it do not.
+    for (share, enough) in [(1.1, true), (0.9, false)] {
+        offsets[2] = share * relaxation.amount;
+        let mut moved = blunt.clone();
+        moved.state_set = Polytope::new(moved.state_set.normals().clone(), offsets.clone());
+        moved.first_step = None;
+        assert_eq!(prepare(&moved).is_ok(), enough, "{share} of {}", relaxation.amount);
+    }
+    // Against a disturbance that no input can bear there is no such offset to name but for all.
+    let mut rough = problem();
+    rough.disturbance = vec![ScalarLaw::Uniform { low: -3.0, high: 3.0 }; 2];
+    assert!(matches!(prepare(&rough), Err(PrepareError::Infeasible(_))));
+}
+
+#[test]
+fn offline_sampling_catches_up_on_missed_steps() {
+    let mut timed = problem();
+    // The same plant by Euler's rule of one second.
+    let unit = DMatrix::identity(2, 2);
+    timed.plant.a.constant -= unit;
+    timed.plant.discretisation = Discretisation::Euler { sample_time_s: 1.0 };
+    let artifact = prepare(&timed).unwrap();
+    let at = |state: &State, x: &DVector<f64>, elapsed: f64| {
+        let elapsed = Some(Seconds::from_seconds(elapsed));
+        let measurement = Measurement { state: x.clone(), elapsed };
+        OfflineSampling::step(&artifact, state, &measurement, Budget::UNLIMITED)
+    };
+    let start = OfflineSampling::start(&artifact);
+    let first = at(&start, &DVector::from_vec(vec![2.0, 0.0]), 0.0).unwrap();
+    let Verdict::Command(command) = &first.verdict else { panic!("{first:?}") };
+    assert_eq!(command.expected_states.len(), 6);
+    assert_eq!(command.expected_inputs[0], command.input);
+    // As expected, two steps late: the rest of the plan is still the best there is, or close.
+    let late = at(&first.next, &command.expected_states[3], 3.0).unwrap();
+    assert_eq!((late.index, late.diagnostics.missed_steps), (3, 2));
+    assert_eq!(late.next.step_index(), 4);
+    // From where nothing is feasible the tail two steps on is flown: u_3 as planned there.
+    let far = DVector::from_vec(vec![3.9, 1.4]);
+    let tail = at(&first.next, &far, 3.0).unwrap();
+    assert_eq!(tail.diagnostics.branch, Branch::PreviousPlanTail);
+    let Verdict::Command(flown) = &tail.verdict else { panic!("{tail:?}") };
+    assert_eq!(flown.corrections[1..2], command.corrections[4..5]);
+    assert_eq!(flown.corrections[2..], [0.0; 3]);
+
+    for (elapsed, state) in [(1.5, &first.next), (0.0, &first.next)] {
+        let refused = at(state, &far, elapsed);
+        let Err(StepError::Measurement(faults)) = refused else { panic!("{refused:?}") };
+        assert_eq!(faults[0].field, "elapsed_s");
+    }
+    let exhausted = at(&first.next, &far, 6.0);
+    assert_eq!(exhausted, Err(StepError::PlanExhausted { missed: 5, commands_left: 4 }));
 }
 
 #[test]
@@ -179,12 +196,12 @@ fn offline_sampling_scaled_inwards_is_inside_the_exact_set() {
     let mut coarse = problem();
     coarse.redundancy = Redundancy::InnerScaled { epsilon: 0.02 };
     let coarse = prepare(&coarse).unwrap();
-    assert!(coarse.summary().kept_rows < exact.summary().kept_rows);
+    assert!(coarse.summary().kept_rows() < exact.summary().kept_rows());
     assert!(coarse.summary().outer_excess > 0.0);
     // A point of the coarse set satisfies every row of the exact one.
     let mut chance = ChaCha8Rng::seed_from_u64(9);
     let sampled: Vec<usize> =
-        (0..exact.rows().len()).filter(|&row| exact.origin(row).is_some()).collect();
+        (0..exact.rows().len()).filter(|&row| exact.origin(row) != RowOrigin::FirstStep).collect();
     let only_sampled = exact.rows().select(&sampled);
     let mut inside = 0;
     for _ in 0..20_000 {

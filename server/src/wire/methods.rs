@@ -12,6 +12,7 @@ use vbar_guidance::{
         Certificate, Controller, Failure, Fault, Infeasibility, PrepareError, StepError,
         abort_safe::{self, AbortSafe},
         disturbance_feedback::{self, DisturbanceFeedback},
+        offline_sampling::OfflineSampling,
         variable_horizon::VariableHorizon,
     },
 };
@@ -45,6 +46,12 @@ pub(super) trait Wired:
     fn canonical_bytes(problem: &Self::Problem) -> Vec<u8>;
     /// Units of the amounts by which constraints are missed.
     fn units(problem: &Self::Problem) -> types::Units;
+    /// Finds every fault that only the mathematics sees: a whole precompute, unless the method
+    /// knows a shorter way.
+    fn check(problem: &Self::Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+        let shards = (0..Self::shards(problem)).map(|i| Self::run_shard(problem, i, budget));
+        Self::merge(problem, shards.collect::<Result<_, _>>()?, budget).map(drop)
+    }
 
     /// The problem an artifact was made for.
     fn problem(artifact: &Self::Artifact) -> &Self::Problem;
@@ -71,8 +78,11 @@ pub(super) trait Wired:
     /// Reads what [`Wired::state_to_bytes`] wrote.
     fn state_from_bytes(bytes: &[u8]) -> Result<Self::State, String>;
 
-    /// The measurement as this method takes it; the fault's field is relative to it.
-    fn measurement(measured: &ElapsedAndState) -> Result<Self::Measurement, Fault>;
+    /// The measurement as this artifact takes it; the fault's field is relative to it.
+    fn measurement(
+        artifact: &Self::Artifact,
+        measured: &ElapsedAndState,
+    ) -> Result<Self::Measurement, Fault>;
 
     /// The state for the next step.
     fn next(step: &Self::Answer) -> &Self::State;
@@ -80,6 +90,10 @@ pub(super) trait Wired:
     fn kind(step: &Self::Answer) -> VerdictKind;
     /// The proof, if there is a command.
     fn certificate(step: &Self::Answer) -> Option<&Certificate>;
+    /// Whether a command may leave: its proof holds, or it says itself that it promises nothing.
+    fn may_leave(step: &Self::Answer) -> bool {
+        Self::certificate(step).is_some_and(|certificate| certificate.passed)
+    }
     /// What the solvers did.
     fn work(step: &Self::Answer) -> SolverWork;
     /// Everything of a step's answer but what its envelope knows: controller state, provenance.
@@ -157,7 +171,7 @@ pub(crate) enum VerdictKind {
     Infeasible,
 }
 
-const METHODS: &str = "one of variable_horizon, disturbance_feedback, abort_safe";
+const METHODS: &str = "one of variable_horizon, disturbance_feedback, abort_safe, offline_sampling";
 
 /// A mission.
 #[derive(Debug, Clone)]
@@ -178,6 +192,9 @@ impl Parse for Problem {
             Some(Message::AbortSafe(problem)) => {
                 asked::<AbortSafe>(problem, path.field("abort_safe"), door)
             }
+            Some(Message::OfflineSampling(problem)) => {
+                asked::<OfflineSampling>(problem, path.field("offline_sampling"), door)
+            }
         }
     }
 }
@@ -188,6 +205,7 @@ fn wired(method: Method) -> &'static dyn AnyMethod {
         Method::VariableHorizon => &Of::<VariableHorizon>(PhantomData),
         Method::DisturbanceFeedback => &Of::<DisturbanceFeedback>(PhantomData),
         Method::AbortSafe => &Of::<AbortSafe>(PhantomData),
+        Method::OfflineSampling => &Of::<OfflineSampling>(PhantomData),
     }
 }
 
@@ -206,6 +224,7 @@ impl Problem {
             Message::VariableHorizon(_) => VariableHorizon::PLANNING,
             Message::DisturbanceFeedback(_) => DisturbanceFeedback::PLANNING,
             Message::AbortSafe(_) => AbortSafe::PLANNING,
+            Message::OfflineSampling(_) => OfflineSampling::PLANNING,
         })
     }
 
@@ -234,14 +253,23 @@ impl Problem {
     }
 
     /// Puts shards, in their order, together.
-    pub(crate) fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
-        self.0.merge(shards)
+    pub(crate) fn merge(
+        &self,
+        shards: Vec<Shard>,
+        budget: Budget<'_>,
+    ) -> Result<Artifact, PrepareError> {
+        self.0.merge(shards, budget)
     }
 
     /// Thinks long once: every shard in order, on the caller's thread.
     pub(crate) fn prepare(&self, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
         let shards = (0..self.shards()).map(|shard| self.run_shard(shard, budget));
-        self.merge(shards.collect::<Result<_, _>>()?)
+        self.merge(shards.collect::<Result<_, _>>()?, budget)
+    }
+
+    /// Finds every fault that only the mathematics sees, and makes nothing.
+    pub(crate) fn check(&self, budget: Budget<'_>) -> Result<(), PrepareError> {
+        self.0.check(budget)
     }
 
     /// Writes why no artifact can be made.
@@ -384,6 +412,11 @@ impl Step {
         self.0.certificate()
     }
 
+    /// Whether a command may leave: its proof holds, or it says itself that it promises nothing.
+    pub(crate) fn may_leave(&self) -> bool {
+        self.0.may_leave()
+    }
+
     /// What the solvers did.
     pub(crate) fn work(&self) -> SolverWork {
         self.0.work()
@@ -417,9 +450,10 @@ trait AnyProblem: fmt::Debug + Send + Sync {
     fn method(&self) -> Method;
     fn canonical_bytes(&self) -> Vec<u8>;
     fn units(&self) -> types::Units;
+    fn check(&self, budget: Budget<'_>) -> Result<(), PrepareError>;
     fn shards(&self) -> usize;
     fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Shard, PrepareError>;
-    fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError>;
+    fn merge(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<Artifact, PrepareError>;
 }
 
 /// A problem of method `M`.
@@ -444,6 +478,10 @@ impl<M: Wired> AnyProblem for Asked<M> {
         M::units(&self.0)
     }
 
+    fn check(&self, budget: Budget<'_>) -> Result<(), PrepareError> {
+        M::check(&self.0, budget)
+    }
+
     fn shards(&self) -> usize {
         M::shards(&self.0)
     }
@@ -452,12 +490,12 @@ impl<M: Wired> AnyProblem for Asked<M> {
         M::run_shard(&self.0, shard, budget).map(|shard| Shard(Box::new(shard)))
     }
 
-    fn merge(&self, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+    fn merge(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
         let own = shards.into_iter().map(|Shard(shard)| match shard.downcast::<M::Shard>() {
             Ok(shard) => Ok(*shard),
             Err(_) => Err(Failure::Numerical("a shard of another method".to_owned())),
         });
-        M::merge(&self.0, own.collect::<Result<_, _>>()?).map(Made::<M>::artifact)
+        M::merge(&self.0, own.collect::<Result<_, _>>()?, budget).map(Made::<M>::artifact)
     }
 }
 
@@ -535,8 +573,8 @@ impl<M: Wired> AnyArtifact for Made<M> {
             return Err(StepError::State("it belongs to another method".to_owned()));
         };
         understood::<M>(measured)?;
-        let measurement =
-            M::measurement(measured).map_err(|fault| StepError::Measurement(vec![fault]))?;
+        let measurement = M::measurement(&self.0, measured)
+            .map_err(|fault| StepError::Measurement(vec![fault]))?;
         let answer = M::step(&self.0, state, &measurement, budget)?;
         Ok(Box::new(Decided { by: self, answer }))
     }
@@ -597,6 +635,7 @@ trait AnyStep: fmt::Debug + Send + Sync {
     fn next(&self) -> State;
     fn kind(&self) -> VerdictKind;
     fn certificate(&self) -> Option<&Certificate>;
+    fn may_leave(&self) -> bool;
     fn work(&self) -> SolverWork;
     fn render(&self, omit_prediction: bool) -> v1::StepResponse;
 }
@@ -624,6 +663,10 @@ impl<M: Wired> AnyStep for Decided<M> {
 
     fn certificate(&self) -> Option<&Certificate> {
         M::certificate(&self.answer)
+    }
+
+    fn may_leave(&self) -> bool {
+        M::may_leave(&self.answer)
     }
 
     fn work(&self) -> SolverWork {

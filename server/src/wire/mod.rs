@@ -5,30 +5,45 @@
 //! to the server, the `.proto` file says which one is made.
 
 mod abort_safe;
+mod artifacts;
 mod calls;
 mod controller_state;
 mod disturbance_feedback;
 mod export;
 mod methods;
+mod offline_sampling;
+mod operations;
 mod orbits;
+mod paging;
 mod types;
 mod variable_horizon;
 
 use std::fmt;
 
+use serde::{Deserialize, Serialize};
+
 pub(crate) use abort_safe::{ReportAnswer, ReportCall, ReportFault};
+pub(crate) use artifacts::{
+    ArtifactAnswer, ArtifactCall, ArtifactsAnswer, ArtifactsCall, DownloadAnswer, DownloadCall,
+    StoredArtifact,
+};
 pub(crate) use calls::{
-    ArtifactAnswer, ArtifactCall, Controller, DecidedStep, ExportCall, InfoAnswer, InfoCall,
-    KeptPlanAnswer, KeptPlanCall, NamedBy, OperationAnswer, OperationName, OperationsAnswer,
-    OperationsCall, PlanAnswer, PlanCall, PlanResult, PlansAnswer, PlansCall, PrecomputeCall,
-    StepAnswer, StepCall, StreamCall, UploadAnswer, UploadCall,
+    Controller, DecidedStep, ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer, KeptPlanCall,
+    PlanAnswer, PlanCall, PlanResult, PlansAnswer, PlansCall, StepAnswer, StepCall, StreamCall,
+    UploadAnswer, UploadCall,
 };
 pub(crate) use controller_state::{ControllerState, StateFault};
 pub(crate) use disturbance_feedback::Claimed;
 pub(crate) use export::{Document, Missing, OcmBurn, OcmFault, Order, read_ocm_burns};
 use methods::Wired;
 pub(crate) use methods::{
-    Artifact, Candidate, PlanVerdict, Planning, Problem, SolverWork, State, Step, VerdictKind,
+    Artifact, Candidate, PlanVerdict, Planning, Problem, Shard, SolverWork, State, Step,
+    VerdictKind,
+};
+pub(crate) use operations::{
+    ERROR_DOMAIN, Failure, NamedBy, NoArtifact, OperationAnswer, OperationFilter, OperationName,
+    OperationOutcome, OperationsAnswer, OperationsCall, PrecomputeCall, Progress, Standing,
+    WaitCall, problem_again,
 };
 pub(crate) use types::{ArtifactId, ElapsedAndState, Provenance};
 pub(crate) use vbar_guidance::control::disturbance_feedback::INSTANTS_MAX as PLAN_INSTANTS_MAX;
@@ -52,6 +67,10 @@ pub struct Limits {
     pub plan_instants_max: usize,
     /// Most states of a safety report.
     pub report_states_max: usize,
+    /// Most rows that samples may make.
+    pub sampled_rows_max: usize,
+    /// Most vertices of an uncertain plant.
+    pub plant_vertices_max: usize,
 }
 
 impl Default for Limits {
@@ -67,6 +86,8 @@ impl Default for Limits {
             polytope_rows_max: 64,
             plan_instants_max: PLAN_INSTANTS_MAX,
             report_states_max: 2000,
+            sampled_rows_max: 2_000_000,
+            plant_vertices_max: 64,
         }
     }
 }
@@ -102,7 +123,8 @@ pub(crate) fn parse<T: Parse>(message: &T::Message, limits: &Limits) -> Result<T
 }
 
 /// One fault of a request.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct Violation {
     /// Where: field names as in the `.proto` files, joined by dots, with indices in brackets.
     pub(crate) path: String,

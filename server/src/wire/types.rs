@@ -367,6 +367,22 @@ pub(super) fn matrix(
     Some(DMatrix::from_row_slice(rows, columns, values))
 }
 
+/// A symmetric matrix of finite numbers; the field is required.
+pub(super) fn symmetric_matrix(
+    message: &Option<v1::Matrix>,
+    size: usize,
+    path: Path<'_>,
+    door: &mut Door,
+) -> Option<DMatrix<f64>> {
+    let message = door.required(message, path)?;
+    let matrix = matrix(message, (Size::Exactly(size), Size::Exactly(size)), path, door)?;
+    let asymmetry = (&matrix - matrix.transpose()).amax();
+    if asymmetry > 1e-12 * matrix.amax() {
+        return door.refuse(path, "a symmetric matrix", format!("asymmetry of {asymmetry:e}"));
+    }
+    Some(matrix)
+}
+
 /// A polytope in a space of `dimension`; a row of zeros says nothing and is refused.
 pub(super) fn polytope(
     message: &v1::PolytopeSet,
@@ -398,6 +414,14 @@ pub(super) fn render_matrix(matrix: &DMatrix<f64>) -> v1::Matrix {
     v1::Matrix { rows: count(matrix.nrows()), columns: count(matrix.ncols()), values }
 }
 
+/// One list a row, all of one length.
+pub(super) fn render_rows(rows: impl ExactSizeIterator<Item = Vec<f64>>) -> v1::Matrix {
+    let count_of_rows = rows.len();
+    let values: Vec<f64> = rows.flatten().collect();
+    let columns = values.len().checked_div(count_of_rows).unwrap_or(0);
+    v1::Matrix { rows: count(count_of_rows), columns: count(columns), values }
+}
+
 /// One vector a row.
 pub(super) fn render_vectors(vectors: &[Vector3<f64>]) -> v1::Matrix {
     let values = vectors.iter().flat_map(|v| [v.x, v.y, v.z]).collect();
@@ -413,6 +437,8 @@ fn render_family(family: ConstraintFamily) -> i32 {
         ConstraintFamily::InitialState => v1::ConstraintFamily::InitialState,
         ConstraintFamily::EmptyInputSet => v1::ConstraintFamily::EmptyInputSet,
         ConstraintFamily::EmptyStateSet => v1::ConstraintFamily::EmptyStateSet,
+        ConstraintFamily::FirstStep => v1::ConstraintFamily::FirstStep,
+        ConstraintFamily::Tube => v1::ConstraintFamily::Tube,
     };
     family.into()
 }
@@ -447,7 +473,9 @@ fn in_metres(family: ConstraintFamily, amount: f64, position_unit_m: Option<f64>
         ConstraintFamily::Dynamics
         | ConstraintFamily::Input
         | ConstraintFamily::Terminal
-        | ConstraintFamily::EmptyInputSet => None,
+        | ConstraintFamily::EmptyInputSet
+        | ConstraintFamily::FirstStep
+        | ConstraintFamily::Tube => None,
     }
 }
 

@@ -9,9 +9,9 @@ use crate::{
     support::{Server, grpc_fields, json_fields, server},
 };
 
-/// Sends `problem` to Precompute over both transports; both must name exactly `fields`.
-async fn check(server: &Server, case: &str, problem: &Value, fields: &[&str]) {
-    let request = json!({ "problem": problem });
+/// Has `problem` checked over both transports; both must name exactly `fields`.
+pub(crate) async fn check(server: &Server, case: &str, problem: &Value, fields: &[&str]) {
+    let request = json!({ "problem": problem, "validateOnly": true });
     let answer = server.post("/v1/precompute", &request).await;
     let error = answer.json();
     assert_eq!(answer.status, 400, "{case}: {error}");
@@ -24,7 +24,7 @@ async fn check(server: &Server, case: &str, problem: &Value, fields: &[&str]) {
 }
 
 /// `problem` with the value at `pointer` replaced, or removed.
-fn with(mut problem: Value, pointer: &str, value: Option<Value>) -> Value {
+pub(crate) fn with(mut problem: Value, pointer: &str, value: Option<Value>) -> Value {
     let (parent, name) = pointer.rsplit_once('/').expect("a pointer");
     let parent = problem.pointer_mut(parent).expect("a parent");
     match (parent, value) {

@@ -51,32 +51,35 @@ async fn check(server: &Server, cases: impl IntoIterator<Item = (&str, Value, &s
 #[tokio::test(flavor = "multi_thread")]
 async fn malformed_abort_safe_numbers_are_named() {
     let server = server().await;
-    check(&server, [
-        ("/orbit", Value::Null, "orbit"),
-        ("/orbit/elements/eccentricity", json!(1.0), "orbit.elements.eccentricity"),
-        ("/orbit/elements/eccentricity", json!(1.7), "orbit.elements.eccentricity"),
-        ("/massKg", Value::Null, "mass_kg"),
-        ("/massKg", json!(-4000.0), "mass_kg"),
-        ("/sampleTimeS", json!(0.0), "sample_time_s"),
-        ("/sampleTimeS", json!("NaN"), "sample_time_s"),
-        ("/periodFolding", json!(9), "period_folding"),
-        ("/frame", Value::Null, "frame"),
-        ("/predictionHorizon", json!(0), "prediction_horizon"),
-        ("/predictionHorizon", json!(121), "prediction_horizon"),
-        ("/clearance", json!(0.0), "clearance"),
-        ("/setTiming", json!(9), "set_timing"),
-        ("/separation", json!(9), "separation"),
-        ("/fallback", Value::Null, "fallback"),
-        ("/fallback", json!(9), "fallback"),
-        ("/arrivalDistanceM", json!(0.0), "arrival_distance_m"),
-        ("/arrivalDistanceM", Value::Null, "arrival_distance_m"),
-        ("/fastestApproachMS", Value::Null, "fastest_approach_m_s"),
-        ("/fastestApproachMS", json!(-1.0), "fastest_approach_m_s"),
-        ("/abortSearch", json!({ "clearanceM": 0.0 }), "abort_search.clearance_m"),
-        ("/abortSearch", json!({ "programsMax": -1 }), "abort_search.programs_max"),
-        ("/stepsMax", json!(0), "steps_max"),
-        ("/stepsMax", json!(10_001), "steps_max"),
-    ])
+    check(
+        &server,
+        [
+            ("/orbit", Value::Null, "orbit"),
+            ("/orbit/elements/eccentricity", json!(1.0), "orbit.elements.eccentricity"),
+            ("/orbit/elements/eccentricity", json!(1.7), "orbit.elements.eccentricity"),
+            ("/massKg", Value::Null, "mass_kg"),
+            ("/massKg", json!(-4000.0), "mass_kg"),
+            ("/sampleTimeS", json!(0.0), "sample_time_s"),
+            ("/sampleTimeS", json!("NaN"), "sample_time_s"),
+            ("/periodFolding", json!(9), "period_folding"),
+            ("/frame", Value::Null, "frame"),
+            ("/predictionHorizon", json!(0), "prediction_horizon"),
+            ("/predictionHorizon", json!(121), "prediction_horizon"),
+            ("/clearance", json!(0.0), "clearance"),
+            ("/setTiming", json!(9), "set_timing"),
+            ("/separation", json!(9), "separation"),
+            ("/fallback", Value::Null, "fallback"),
+            ("/fallback", json!(9), "fallback"),
+            ("/arrivalDistanceM", json!(0.0), "arrival_distance_m"),
+            ("/arrivalDistanceM", Value::Null, "arrival_distance_m"),
+            ("/fastestApproachMS", Value::Null, "fastest_approach_m_s"),
+            ("/fastestApproachMS", json!(-1.0), "fastest_approach_m_s"),
+            ("/abortSearch", json!({ "clearanceM": 0.0 }), "abort_search.clearance_m"),
+            ("/abortSearch", json!({ "programsMax": -1 }), "abort_search.programs_max"),
+            ("/stepsMax", json!(0), "steps_max"),
+            ("/stepsMax", json!(10_001), "steps_max"),
+        ],
+    )
     .await;
     let limits = Limits { horizon_max: 20, steps_max: 50, ..Limits::default() };
     let strict = server_with(Config { limits, ..Config::default() }).await;
@@ -119,28 +122,30 @@ async fn malformed_abort_safe_sample_time_comes_with_those_that_fit() {
 #[tokio::test(flavor = "multi_thread")]
 async fn malformed_abort_safe_thrusters_are_named() {
     let server = server().await;
-    let thruster = |direction: [f64; 3], force: f64| {
-        json!({ "direction": direction, "forceMaxN": force })
-    };
+    let thruster =
+        |direction: [f64; 3], force: f64| json!({ "direction": direction, "forceMaxN": force });
     let list = |thrusters: Vec<Value>| json!({ "list": { "thrusters": thrusters } });
     let up = thruster([1.0, 0.0, 0.0], 20.0);
-    check(&server, [
-        ("/thrusters", Value::Null, "thrusters"),
-        ("/thrusters", json!({}), "thrusters"),
-        ("/thrusters", json!({ "cubeCorners": {} }), "thrusters.cube_corners.force_max_n"),
-        ("/thrusters", list(vec![]), "thrusters.list.thrusters"),
-        ("/thrusters", list(vec![up.clone(); 17]), "thrusters.list.thrusters"),
-        (
-            "/thrusters",
-            list(vec![up.clone(), thruster([0.0; 3], 1.0)]),
-            "thrusters.list.thrusters[1].direction",
-        ),
-        (
-            "/thrusters",
-            list(vec![thruster([0.0, 1.0, 0.0], -1.0)]),
-            "thrusters.list.thrusters[0].force_max_n",
-        ),
-    ])
+    check(
+        &server,
+        [
+            ("/thrusters", Value::Null, "thrusters"),
+            ("/thrusters", json!({}), "thrusters"),
+            ("/thrusters", json!({ "cubeCorners": {} }), "thrusters.cube_corners.force_max_n"),
+            ("/thrusters", list(vec![]), "thrusters.list.thrusters"),
+            ("/thrusters", list(vec![up.clone(); 17]), "thrusters.list.thrusters"),
+            (
+                "/thrusters",
+                list(vec![up.clone(), thruster([0.0; 3], 1.0)]),
+                "thrusters.list.thrusters[1].direction",
+            ),
+            (
+                "/thrusters",
+                list(vec![thruster([0.0, 1.0, 0.0], -1.0)]),
+                "thrusters.list.thrusters[0].force_max_n",
+            ),
+        ],
+    )
     .await;
 }
 
@@ -149,29 +154,32 @@ async fn malformed_abort_safe_phases_are_named() {
     let server = server().await;
     let modes = |modes: Value| json!({ "list": { "modes": modes } });
     const MODES: &str = "/phases/2/active/modes";
-    check(&server, [
-        ("/phases", json!([]), "phases"),
-        ("/phases/3/advanceWithinM", json!(1.0), "phases[3].advance_within_m"),
-        ("/phases/0/advanceWithinM", Value::Null, "phases[0].advance_within_m"),
-        ("/phases/0/advanceWithinM", json!(-1.0), "phases[0].advance_within_m"),
-        ("/phases/3/nothingAvoided", Value::Null, "phases[3]"),
-        ("/phases/0/passive/watch", Value::Null, "phases[0].passive.watch"),
-        (MODES, Value::Null, "phases[2].active.modes"),
-        (MODES, json!({}), "phases[2].active.modes"),
-        (MODES, json!({ "preset": 0 }), "phases[2].active.modes.preset"),
-        (MODES, json!({ "preset": 9 }), "phases[2].active.modes.preset"),
-        (MODES, modes(json!([])), "phases[2].active.modes.list.modes"),
-        (
-            MODES,
-            modes(json!([{ "indices": [8] }])),
-            "phases[2].active.modes.list.modes[0].indices[0]",
-        ),
-        (
-            MODES,
-            modes(json!([{ "indices": [1] }, { "indices": [1] }])),
-            "phases[2].active.modes.list.modes[1]",
-        ),
-    ])
+    check(
+        &server,
+        [
+            ("/phases", json!([]), "phases"),
+            ("/phases/3/advanceWithinM", json!(1.0), "phases[3].advance_within_m"),
+            ("/phases/0/advanceWithinM", Value::Null, "phases[0].advance_within_m"),
+            ("/phases/0/advanceWithinM", json!(-1.0), "phases[0].advance_within_m"),
+            ("/phases/3/nothingAvoided", Value::Null, "phases[3]"),
+            ("/phases/0/passive/watch", Value::Null, "phases[0].passive.watch"),
+            (MODES, Value::Null, "phases[2].active.modes"),
+            (MODES, json!({}), "phases[2].active.modes"),
+            (MODES, json!({ "preset": 0 }), "phases[2].active.modes.preset"),
+            (MODES, json!({ "preset": 9 }), "phases[2].active.modes.preset"),
+            (MODES, modes(json!([])), "phases[2].active.modes.list.modes"),
+            (
+                MODES,
+                modes(json!([{ "indices": [8] }])),
+                "phases[2].active.modes.list.modes[0].indices[0]",
+            ),
+            (
+                MODES,
+                modes(json!([{ "indices": [1] }, { "indices": [1] }])),
+                "phases[2].active.modes.list.modes[1]",
+            ),
+        ],
+    )
     .await;
 }
 
@@ -190,9 +198,8 @@ async fn malformed_abort_safe_watches_are_named() {
         1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, //
         -1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0,
     ];
-    let shape = |values: [f64; 9]| {
-        json!({ "shapeM2": { "rows": 3, "columns": 3, "values": values } })
-    };
+    let shape =
+        |values: [f64; 9]| json!({ "shapeM2": { "rows": 3, "columns": 3, "values": values } });
     let mut long = cube.clone();
     long[0] = 2.0;
     let cases = [
@@ -249,25 +256,27 @@ async fn malformed_abort_safe_weights_are_named() {
     const WEIGHTS: &str = "/phases/1/weights";
     let at = |name: &str| format!("{WEIGHTS}/{name}");
     let (stage, input, terminal) = (at("stage"), at("input"), at("terminal"));
+    let (stage, input, terminal) = (stage.as_str(), input.as_str(), terminal.as_str());
     let mut lopsided = vec![0.0; 36];
     (0..6).for_each(|i| lopsided[7 * i] = 1.0);
     lopsided[1] = 0.5;
-    let matrix = |size: i32, values: Vec<f64>| {
-        json!({ "matrix": { "rows": size, "columns": size, "values": values } })
-    };
+    let matrix = |size: i32, values: Vec<f64>| json!({ "matrix": { "rows": size, "columns": size, "values": values } });
     let diagonal = |values: Vec<f64>| json!({ "diagonal": { "values": values } });
-    check(&server, [
-        (WEIGHTS, Value::Null, "phases[1].weights"),
-        (&stage, Value::Null, "phases[1].weights.stage"),
-        (&stage, json!({}), "phases[1].weights.stage"),
-        (&stage, json!({ "identityTimes": -1.0 }), "phases[1].weights.stage.identity_times"),
-        (&stage, diagonal(vec![1.0; 3]), "phases[1].weights.stage.diagonal.values"),
-        (&terminal, diagonal(vec![1.0, 1.0, -1.0, 1.0, 1.0, 1.0]), "phases[1].weights.terminal"),
-        (&terminal, matrix(6, lopsided), "phases[1].weights.terminal"),
-        (&terminal, matrix(3, vec![0.0; 9]), "phases[1].weights.terminal.matrix.rows"),
-        (&input, json!({ "identityTimes": 0.0 }), "phases[1].weights.input"),
-        (&input, diagonal(vec![1.0, 0.0, 1.0]), "phases[1].weights.input"),
-    ])
+    check(
+        &server,
+        [
+            (WEIGHTS, Value::Null, "phases[1].weights"),
+            (stage, Value::Null, "phases[1].weights.stage"),
+            (stage, json!({}), "phases[1].weights.stage"),
+            (stage, json!({ "identityTimes": -1.0 }), "phases[1].weights.stage.identity_times"),
+            (stage, diagonal(vec![1.0; 3]), "phases[1].weights.stage.diagonal.values"),
+            (terminal, diagonal(vec![1.0, 1.0, -1.0, 1.0, 1.0, 1.0]), "phases[1].weights.terminal"),
+            (terminal, matrix(6, lopsided), "phases[1].weights.terminal"),
+            (terminal, matrix(3, vec![0.0; 9]), "phases[1].weights.terminal.matrix.rows"),
+            (input, json!({ "identityTimes": 0.0 }), "phases[1].weights.input"),
+            (input, diagonal(vec![1.0, 0.0, 1.0]), "phases[1].weights.input"),
+        ],
+    )
     .await;
 }
 
@@ -304,9 +313,11 @@ async fn abort_safe_mission_told_in_other_axes_is_the_same_mission() {
     };
     let corners = |signs: fn(f64, f64, f64) -> [f64; 3]| {
         let sign = |i: i32, bit: i32| if i >> bit & 1 == 0 { 1.0 } else { -1.0 };
-        let corner = |i| json!({
-            "direction": signs(sign(i, 2), sign(i, 1), sign(i, 0)), "forceMaxN": 20.0,
-        });
+        let corner = |i| {
+            json!({
+                "direction": signs(sign(i, 2), sign(i, 1), sign(i, 0)), "forceMaxN": 20.0,
+            })
+        };
         json!({ "list": { "thrusters": (0..8).map(corner).collect::<Vec<_>>() } })
     };
     let axes = |lengths: [f64; 3]| json!({ "semiAxes": { "semiAxesM": lengths } });

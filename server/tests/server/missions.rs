@@ -138,6 +138,14 @@ pub(crate) fn message<M: prost::Message + prost::Name + Default>(json: Value) ->
     message.expect("JSON of this message").transcode_to().expect("the same contract")
 }
 
+/// The JSON of `message`.
+#[allow(dead_code, reason = "the benchmarks share this file and send messages only")]
+pub(crate) fn json<M: prost::Message + prost::Name + Default>(message: &M) -> Value {
+    let mut dynamic = DynamicMessage::new(descriptor::<M>());
+    dynamic.transcode_from(message).expect("the same contract");
+    serde_json::to_value(dynamic).expect("a message of the contract")
+}
+
 fn descriptor<M: prost::Name>() -> MessageDescriptor {
     DESCRIPTORS.get_message_by_name(&M::full_name()).expect("a message of the contract")
 }

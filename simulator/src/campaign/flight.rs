@@ -322,13 +322,28 @@ impl Patience {
     }
 }
 
+/// Asks a loop for its next decision; the time from question to answer comes with it.
+pub(crate) async fn ask(
+    closed_loop: &mut ClosedLoop,
+    question: Measurement,
+    run: u32,
+) -> Result<(StepResponse, Duration), SimulationError> {
+    let asked = Instant::now();
+    let mut patience = Patience::new(run);
+    loop {
+        match closed_loop.step(question.clone()).await {
+            Ok(response) => return Ok((response, asked.elapsed())),
+            Err(error) => patience.after(error).await?,
+        }
+    }
+}
+
 /// Has the artifact of `problem` made; the inner error is the service's reason.
-async fn prepare(
+pub(crate) async fn make(
     client: &Client,
     run: u32,
-    problem: v1::Problem,
-) -> Result<Result<Prepared, String>, SimulationError> {
-    let model = Model::new(&problem).map_err(crate::mission::MissionError::Invalid)?;
+    problem: &v1::Problem,
+) -> Result<Result<v1::Artifact, String>, SimulationError> {
     let mut patience = Patience::new(run);
     let made = loop {
         match client.precompute(problem.clone()).await {
@@ -336,12 +351,28 @@ async fn prepare(
             Err(error) => patience.after(error).await?,
         }
     };
-    let answer = |what: &str| SimulationError::Answer { run, what: what.to_owned() };
-    let made = match made.outcome {
-        Some(v1::precompute_response::Outcome::Artifact(artifact)) => artifact,
-        Some(v1::precompute_response::Outcome::Infeasible(why)) => return Ok(Err(why.reason)),
-        None => return Err(answer("a precompute without an outcome")),
+    match made.outcome {
+        Some(v1::precompute_response::Outcome::Artifact(artifact)) => Ok(Ok(artifact)),
+        Some(v1::precompute_response::Outcome::Infeasible(why)) => Ok(Err(why.reason)),
+        None => {
+            let what = "a precompute without an outcome".to_owned();
+            Err(SimulationError::Answer { run, what })
+        }
+    }
+}
+
+/// Makes the artifact of `problem` and reads it; the inner error is the service's reason.
+async fn prepare(
+    client: &Client,
+    run: u32,
+    problem: v1::Problem,
+) -> Result<Result<Prepared, String>, SimulationError> {
+    let model = Model::new(&problem).map_err(crate::mission::MissionError::Invalid)?;
+    let made = match make(client, run, &problem).await? {
+        Ok(made) => made,
+        Err(reason) => return Ok(Err(reason)),
     };
+    let answer = |what: &str| SimulationError::Answer { run, what: what.to_owned() };
     let Some(v1::artifact::Summary::VariableHorizon(artifact)) = made.summary else {
         return Err(answer("an artifact without its summary"));
     };
@@ -480,16 +511,8 @@ impl Session {
         &mut self,
         state: &DVector<f64>,
     ) -> Result<(Decision, Option<v1::Prediction>), SimulationError> {
-        let asked = Instant::now();
         let question = self.measurement(state);
-        let mut patience = Patience::new(self.run);
-        let response = loop {
-            match self.closed_loop.step(question.clone()).await {
-                Ok(response) => break response,
-                Err(error) => patience.after(error).await?,
-            }
-        };
-        let latency = asked.elapsed();
+        let (response, latency) = ask(&mut self.closed_loop, question, self.run).await?;
         let prediction = response.prediction.clone();
         let decision = self.read(response, state, latency);
         let run = self.run;

@@ -7,6 +7,7 @@ pub(crate) mod crew;
 pub(crate) mod flight;
 pub(crate) mod plan;
 pub(crate) mod progress;
+pub(crate) mod sampling;
 pub(crate) mod search;
 pub(crate) mod sets;
 pub(crate) mod vehicle;

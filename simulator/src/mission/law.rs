@@ -55,6 +55,22 @@ impl OrbitElements {
             mean_anomaly_rad: self.mean_anomaly_deg.to_radians(),
         }
     }
+
+    pub(crate) fn check(&self, place: &str, faults: &mut Vec<String>) {
+        let perigee_km = self.semi_major_axis_km * (1.0 - self.eccentricity);
+        if !(0.0..1.0).contains(&self.eccentricity) || !(6400.0..1e6).contains(&perigee_km) {
+            faults.push(format!("{place}: an ellipse with its perigee above 6400 km"));
+        }
+        let angles = [
+            self.inclination_deg,
+            self.ascending_node_deg,
+            self.argument_of_perigee_deg,
+            self.mean_anomaly_deg,
+        ];
+        if angles.iter().any(|angle| !angle.is_finite() || angle.abs() > 360.0) {
+            faults.push(format!("{place}: angles within a full turn"));
+        }
+    }
 }
 
 impl TruthLaw {
@@ -63,19 +79,7 @@ impl TruthLaw {
         if matches!(model.kind, Kind::Linear(_)) {
             faults.push(format!("{place}.two_body: only for a spacecraft plant"));
         }
-        let perigee_km = elements.semi_major_axis_km * (1.0 - elements.eccentricity);
-        if !(0.0..1.0).contains(&elements.eccentricity) || !(6400.0..1e6).contains(&perigee_km) {
-            faults.push(format!("{place}.two_body: an ellipse with its perigee above 6400 km"));
-        }
-        let angles = [
-            elements.inclination_deg,
-            elements.ascending_node_deg,
-            elements.argument_of_perigee_deg,
-            elements.mean_anomaly_deg,
-        ];
-        if angles.iter().any(|angle| !angle.is_finite() || angle.abs() > 360.0) {
-            faults.push(format!("{place}.two_body: angles within a full turn"));
-        }
+        elements.check(&format!("{place}.two_body"), faults);
     }
 }
 
@@ -194,7 +198,7 @@ fn direction(chance: &mut impl Rng) -> Vector3<f64> {
     Vector3::new(radius * c, radius * s, height)
 }
 
-fn uniform(chance: &mut impl Rng, lower: f64, upper: f64) -> f64 {
+pub(crate) fn uniform(chance: &mut impl Rng, lower: f64, upper: f64) -> f64 {
     lower + (upper - lower) * chance.random::<f64>()
 }
 

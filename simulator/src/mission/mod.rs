@@ -3,7 +3,8 @@
 //!
 //! Top level: `name`, `description` (where the numbers come from, and what the paper leaves open),
 //! `problem` (canonical JSON of `vbar.v1.Problem`), `simulation`, `published`. The last two mean
-//! what the problem's method needs: see [`AbortMission`], [`Mission`] and [`PlanMission`]. Unknown fields are refused
+//! what the problem's method needs: see [`AbortMission`], [`Mission`], [`PlanMission`] and
+//! [`SamplingMission`]. Unknown fields are refused
 //! everywhere.
 
 pub(crate) mod abort;
@@ -12,6 +13,9 @@ pub(crate) mod law;
 pub(crate) mod model;
 pub(crate) mod plan;
 pub(crate) mod plan_model;
+pub(crate) mod sampling;
+pub(crate) mod sampling_law;
+pub(crate) mod sampling_model;
 mod start;
 
 use std::{collections::BTreeMap, fs, path::Path};
@@ -27,6 +31,7 @@ pub use abort::{AbortCase, AbortMission, AbortSources};
 use law::{DisturbanceLaw, InitialLaw, Randomisation, TruthLaw};
 use model::Model;
 pub use plan::{PlanChanges, PlanMission, PublishedAxes, metric_name, metric_named};
+pub use sampling::{PublishedEffort, SamplingMission, sampling_scheme_name, sampling_scheme_named};
 
 /// Largest mission file that is read.
 const FILE_BYTES_MAX: u64 = 16 << 20;
@@ -43,6 +48,8 @@ pub enum MissionFile {
     VariableHorizon(Box<Mission>),
     /// Fixed-time plans with disturbance feedback.
     DisturbanceFeedback(Box<PlanMission>),
+    /// Closed loops under sampled chance constraints.
+    OfflineSampling(Box<SamplingMission>),
 }
 
 impl MissionFile {
@@ -74,6 +81,10 @@ impl MissionFile {
             return PlanMission::parse(text)
                 .map(|mission| Self::DisturbanceFeedback(mission.into()));
         }
+        if asks(["offlineSampling", "offline_sampling"]) {
+            return SamplingMission::parse(text)
+                .map(|mission| Self::OfflineSampling(mission.into()));
+        }
         Mission::parse(text).map(|mission| Self::VariableHorizon(mission.into()))
     }
 
@@ -84,6 +95,7 @@ impl MissionFile {
             Self::AbortSafe(mission) => &mission.name,
             Self::VariableHorizon(mission) => &mission.name,
             Self::DisturbanceFeedback(mission) => &mission.name,
+            Self::OfflineSampling(mission) => &mission.name,
         }
     }
 
@@ -94,6 +106,7 @@ impl MissionFile {
             Self::AbortSafe(mission) => mission.problem,
             Self::VariableHorizon(mission) => mission.problem,
             Self::DisturbanceFeedback(mission) => mission.problem,
+            Self::OfflineSampling(mission) => mission.problem,
         }
     }
 }
@@ -411,9 +424,11 @@ mod tests {
             "double_integrator",
             "envisat",
             "gto",
+            "hcw_docking",
             "iss",
             "leo_tumbler",
             "perturbed_55",
+            "poseidyn",
             "prisma",
             "simbol_x",
             "tumbling_satellite",

@@ -78,7 +78,7 @@ pub(super) fn page(
     path: &Path,
     size: (u32, u32),
     title: &str,
-    legend: &[Entry],
+    legend: &[(impl AsRef<str>, Mark, RGBColor)],
     draw: impl FnOnce(&Area<'_>) -> Result<(), PictureError>,
 ) -> Result<PathBuf, PictureError> {
     let mut text = String::new();
@@ -95,7 +95,10 @@ pub(super) fn page(
     Ok(path.to_path_buf())
 }
 
-fn draw_legend(header: &Area<'_>, legend: &[Entry]) -> Result<(), PictureError> {
+fn draw_legend(
+    header: &Area<'_>,
+    legend: &[(impl AsRef<str>, Mark, RGBColor)],
+) -> Result<(), PictureError> {
     let mut x = MARGIN;
     let y = 46;
     for (name, mark, color) in legend {
@@ -114,7 +117,8 @@ fn draw_legend(header: &Area<'_>, legend: &[Entry]) -> Result<(), PictureError> 
                 header.draw(&Polygon::new(corners, color.mix(0.35).filled()))?;
             }
         }
-        header.draw(&Text::new((*name).to_owned(), (x + 30, y - 8), font(18.0)))?;
+        let name = name.as_ref();
+        header.draw(&Text::new(name.to_owned(), (x + 30, y - 8), font(18.0)))?;
         // No font is measured here: 8 px a character is wide enough for 14.5 px sans-serif.
         x += 30 + 8 * i32::try_from(name.chars().count()).unwrap_or(0) + 22;
     }

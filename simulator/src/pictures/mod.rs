@@ -7,7 +7,9 @@ pub(crate) mod abort;
 mod chart;
 pub(crate) mod plan;
 mod plane;
+mod region;
 mod rendezvous;
+pub(crate) mod sampling;
 mod series;
 
 use std::{

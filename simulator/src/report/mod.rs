@@ -2,6 +2,7 @@
 
 pub(crate) mod abort;
 pub(crate) mod plan;
+pub(crate) mod sampling;
 mod statistics;
 mod table;
 

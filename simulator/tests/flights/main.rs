@@ -6,6 +6,7 @@
 mod aborts;
 mod closed_loops;
 mod plans;
+mod sampling;
 
 use vbar_client::Client;
 use vbar_server::{Config, Node};

@@ -38,6 +38,9 @@ pub struct Step {
     pub trajectory: Option<Trajectory>,
     /// The proof; `None` without a regulator's command.
     pub certificate: Option<Certificate>,
+    /// The measured state is in a backward reachable set of its own time index: if thrusters
+    /// failed now, nothing would help.
+    pub unsafe_state: Option<UnsafeState>,
     /// What could be done if thrusters failed at the next sample; `None` in phases that avoid
     /// nothing, and without a command.
     pub safety: Option<StateVerdict>,
@@ -132,6 +135,22 @@ pub struct Trajectory {
     pub forces_n: Vec<Vector3<f64>>,
 }
 
+/// A state that is unsafe already.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UnsafeState {
+    /// The failure whose set holds it deepest: thrusters that still work after it.
+    pub working: ThrustMode,
+    /// Seconds until the earliest instant whose set holds it.
+    pub doomed_after_s: f64,
+    /// The instant of the deepest set, in parts of a step after the state.
+    pub instant: usize,
+    /// Its gauge at the state, at most 1.
+    pub gauge: f64,
+    /// A state near it that no set of its time index holds, if one was found: nearest in metres
+    /// and in metres per second over the mean motion, among those that the search saw.
+    pub outside: Option<RelativeVector>,
+}
+
 /// What could be done from a state if thrusters failed there.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StateVerdict {
@@ -189,6 +208,8 @@ pub struct Diagnostics {
     pub least_clearance: f64,
     /// Largest violation of a half-space; 0 unless softened.
     pub violation: f64,
+    /// Why it was softened, and what would have made that needless.
+    pub infeasibility: Option<Infeasibility>,
     /// The closest moment of the predicted trajectory to the target, between samples too; `least`
     /// is in square metres. `None` without a prediction.
     pub closest: Option<Closest>,

@@ -10,16 +10,21 @@ use crate::{
     dynamics::PeriodicPlant,
     mission::{ThrustMode, dominating_modes},
     reach::{EllipsoidUnion, PolytopeQuestion, PolytopeUnion},
-    sets::{CentredEllipsoid, Polytope},
+    sets::{CentredEllipsoid, Polytope, ZonotopeFacets},
 };
 
 /// Starts of one shard.
 const STARTS_A_SHARD: usize = 16;
+/// Sets of so many modes at most are counted, beside those that stand for all; every set of eight
+/// thrusters' failures is within it.
+const COUNTED_MODES_MAX: usize = 256;
 
 /// The prepared mission.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Artifact {
     problem: Problem,
+    /// Forces of all thrusters.
+    nominal: ZonotopeFacets,
     pub(super) phases: Vec<PreparedPhase>,
 }
 
@@ -40,10 +45,12 @@ pub(super) enum PhaseSets {
         around: Polytope,
         union: EllipsoidUnion,
     },
+    /// With the modes that stand for all, and how many sets all of them have, if counted.
     Polytopes {
         avoid: Polytope,
         modes: Vec<ThrustMode>,
         union: PolytopeUnion,
+        sets_of_all_modes: Option<usize>,
     },
 }
 
@@ -57,7 +64,8 @@ pub struct Shard {
 enum ShardPart {
     Nothing,
     Ellipsoids(usize, EllipsoidUnion),
-    Polytopes(usize, PolytopeUnion),
+    /// With the number of sets of all modes that were asked for, if counted.
+    Polytopes(usize, PolytopeUnion, Option<usize>),
 }
 
 impl Artifact {
@@ -77,6 +85,10 @@ impl Artifact {
         &self.problem
     }
 
+    pub(super) fn nominal_forces(&self) -> &ZonotopeFacets {
+        &self.nominal
+    }
+
     pub(super) fn phase(&self, index: usize) -> (&Phase, &PreparedPhase) {
         let index = index.min(self.phases.len() - 1);
         (&self.problem.phases[index], &self.phases[index])
@@ -91,7 +103,10 @@ impl Artifact {
             match &phase.sets {
                 PhaseSets::None => {}
                 PhaseSets::Ellipsoids { union, .. } => union.write(&mut writer),
-                PhaseSets::Polytopes { union, .. } => union.write(&mut writer),
+                PhaseSets::Polytopes { union, sets_of_all_modes, .. } => {
+                    union.write(&mut writer);
+                    writer.option(*sets_of_all_modes, Writer::count);
+                }
             }
         }
         writer.finish()
@@ -120,15 +135,20 @@ impl Artifact {
                 (Some(watch), Form::Polytope(avoid, modes)) => {
                     let count = instants(watch);
                     let union = PolytopeUnion::read(&mut reader, starts, modes.len(), count)?;
-                    PhaseSets::Polytopes { avoid, modes, union }
+                    let sets_of_all_modes = reader.option(Reader::count)?;
+                    PhaseSets::Polytopes { avoid, modes, union, sets_of_all_modes }
                 }
                 _ => PhaseSets::None,
             };
             phases.push(PreparedPhase { plant, sets });
         }
         reader.end()?;
-        Ok(Self { problem, phases })
+        Ok(Self { nominal: nominal(&problem), problem, phases })
     }
+}
+
+fn nominal(problem: &Problem) -> ZonotopeFacets {
+    problem.thrusters.admissible(problem.thrusters.nominal()).facets()
 }
 
 /// How the set of a phase is represented.
@@ -192,19 +212,30 @@ pub(super) fn run_shard(
     let part = match form(phase) {
         Form::None => ShardPart::Nothing,
         Form::Ellipsoid(avoid, _) => {
-            ShardPart::Ellipsoids(index, EllipsoidUnion::new(&plant, &avoid, horizon, starts))
+            let union = EllipsoidUnion::new(&plant, &avoid, horizon, starts, budget)?;
+            ShardPart::Ellipsoids(index, union)
         }
         Form::Polytope(avoid, modes) => {
             let forces = problem.thrusters.full_forces_n();
-            let bits: Vec<u32> = modes.iter().map(|mode| mode.bits()).collect();
+            let bits = |modes: &[ThrustMode]| modes.iter().map(|mode| mode.bits()).collect();
+            let (needed, all): (Vec<u32>, Vec<u32>) = (bits(&modes), bits(phase.safety.modes()));
             let question = PolytopeQuestion {
                 plant: &plant,
                 avoid: &avoid,
                 full_forces_n: &forces,
-                modes: &bits,
+                modes: &needed,
                 horizon,
             };
-            ShardPart::Polytopes(index, PolytopeUnion::new(&question, starts))
+            let union = PolytopeUnion::new(&question, starts.clone(), budget)?;
+            let count = match all.len() {
+                few if few == needed.len() => Some(union.len()),
+                0..=COUNTED_MODES_MAX => {
+                    let question = PolytopeQuestion { modes: &all, ..question };
+                    Some(PolytopeUnion::count(&question, starts, budget)?)
+                }
+                _ => None,
+            };
+            ShardPart::Polytopes(index, union, count)
         }
     };
     Ok(Shard { part })
@@ -219,21 +250,24 @@ pub(super) fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, P
     let missing = || PrepareError::Failure(Failure::Numerical("shards are missing".into()));
     let mut ellipsoids: Vec<Vec<EllipsoidUnion>> = vec![Vec::new(); count];
     let mut polytopes: Vec<Vec<PolytopeUnion>> = vec![Vec::new(); count];
+    let mut counts: Vec<Option<usize>> = vec![Some(0); count];
     for shard in shards {
         match shard.part {
             ShardPart::Nothing => {}
             ShardPart::Ellipsoids(phase, union) => {
                 ellipsoids.get_mut(phase).ok_or_else(missing)?.push(union);
             }
-            ShardPart::Polytopes(phase, union) => {
+            ShardPart::Polytopes(phase, union, sets) => {
                 polytopes.get_mut(phase).ok_or_else(missing)?.push(union);
+                counts[phase] = counts[phase].zip(sets).map(|(sum, sets)| sum + sets);
             }
         }
     }
     let starts = problem.steps_per_period;
-    let parts = problem.phases.iter().zip(ellipsoids.into_iter().zip(polytopes));
-    let phases = parts
-        .map(|(phase, (ellipsoids, polytopes))| {
+    let parts = ellipsoids.into_iter().zip(polytopes).zip(counts);
+    let phases = problem.phases.iter().zip(parts);
+    let phases = phases
+        .map(|(phase, ((ellipsoids, polytopes), sets_of_all_modes))| {
             let sets = match form(phase) {
                 Form::None => PhaseSets::None,
                 Form::Ellipsoid(avoid, around) => {
@@ -246,11 +280,11 @@ pub(super) fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, P
                     let union = PolytopeUnion::joined(polytopes)
                         .filter(|union| union.starts() == starts)
                         .ok_or_else(missing)?;
-                    PhaseSets::Polytopes { avoid, modes, union }
+                    PhaseSets::Polytopes { avoid, modes, union, sets_of_all_modes }
                 }
             };
             Ok(PreparedPhase { plant: plant(problem, phase), sets })
         })
         .collect::<Result<_, PrepareError>>()?;
-    Ok(Artifact { problem: problem.clone(), phases })
+    Ok(Artifact { nominal: nominal(problem), problem: problem.clone(), phases })
 }

@@ -6,15 +6,17 @@ use super::{Phase, Problem, Safety, Separation};
 use crate::control::Fault;
 
 /// Most numbers that the sets of a phase may need: 512 MB.
-const NUMBERS_MAX: usize = 64_000_000;
+pub const NUMBERS_MAX: usize = 64_000_000;
 /// Longest prediction: the dense program's cost grows with its cube.
-const PREDICTION_MAX: usize = 120;
-/// Most steps of a period, of a safety horizon and parts of a step.
-const STEPS_MAX: usize = 10_000;
-const FRACTIONS_MAX: usize = 64;
+pub const PREDICTION_MAX: usize = 120;
+/// Most steps of a period, and of a safety horizon.
+pub const STEPS_MAX: usize = 10_000;
+/// Most parts of a step.
+pub const FRACTIONS_MAX: usize = 64;
 /// Most instants of a safety horizon: artifacts keep their indices in two bytes.
-const INSTANTS_MAX: usize = 60_000;
-const NEAREST_MAX: usize = 16;
+pub const INSTANTS_MAX: usize = 60_000;
+/// Most sets that a predicted state is kept out of.
+pub const NEAREST_MAX: usize = 16;
 /// Coefficients of a general ellipsoid.
 const ELLIPSOID_TERMS: usize = 21;
 

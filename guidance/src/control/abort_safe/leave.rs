@@ -1,8 +1,7 @@
 //! Leaving: the first step of an abort, and those after it.
 
 use super::{
-    AbortCommand, AbortOrigin, AbortReason, State, Step, Verdict, safety::Judge, state::UnderWay,
-    step::Here,
+    AbortCommand, AbortOrigin, AbortReason, State, Step, Verdict, state::UnderWay, step::Here,
 };
 use crate::{
     control::{Infeasibility, StepError},
@@ -145,9 +144,5 @@ impl Here<'_> {
     fn with_abort(&self, verdict: Verdict, abort: Option<UnderWay>) -> Step {
         let step = self.without_command(verdict);
         Step { next: State { abort, ..step.next }, ..step }
-    }
-
-    fn judge(&self) -> Judge<'_> {
-        Judge { problem: self.problem, phase: self.phase, prepared: self.prepared }
     }
 }

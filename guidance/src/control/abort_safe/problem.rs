@@ -3,6 +3,7 @@
 use nalgebra::{Matrix3, SMatrix};
 
 use crate::{
+    epoch::Epoch,
     mission::{AvoidanceSet, ThrustMode, Thrusters},
     orbit::KeplerOrbit,
     units::{Distance, Mass, Seconds},
@@ -11,6 +12,8 @@ use crate::{
 /// A rendezvous that can be aborted at every step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
+    /// The moment of step 0, for documents; the mathematics counts from it.
+    pub epoch: Option<Epoch>,
     /// The target's orbit; its true anomaly is that of step 0.
     pub orbit: KeplerOrbit,
     /// Of the chaser.

@@ -37,7 +37,11 @@ impl Regulator {
         let n = here.problem.prediction_horizon;
         let steps = (here.k..here.k + n).map(|i| here.prepared.plant.step(i));
         let thrusters = &here.problem.thrusters;
-        let shape = thrusters.admissible(working).facets();
+        let shape = if working == thrusters.nominal() {
+            here.nominal.clone()
+        } else {
+            thrusters.admissible(working).facets()
+        };
         let unit_n = thrusters.list().iter().map(|t| t.force_max().newtons()).fold(0.0, f64::max);
         Self {
             steps: steps.map(|step| (step.a, step.b)).collect(),

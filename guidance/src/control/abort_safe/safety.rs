@@ -89,7 +89,7 @@ impl Judge<'_> {
                         verdict.modes.push(drift.mode.clone());
                         continue;
                     }
-                    let doomed_after_s = search.doomed_after_s(&[working])[0];
+                    let doomed_after_s = search.doomed_after_s(&[working], budget)?[0];
                     let drifts = matches!(drift.mode.abort, AbortVerdict::Found(_));
                     let abort = if drifts {
                         drift.mode.abort.clone()
@@ -99,9 +99,9 @@ impl Judge<'_> {
                     verdict.modes.push(ModeVerdict { working, doomed_after_s, abort });
                 }
             }
-            PhaseSets::Polytopes { avoid, modes, .. } => {
+            PhaseSets::Polytopes { avoid, modes, union, .. } => {
                 let search = self.search(avoid, k, x, horizon);
-                verdict.modes = search.verdicts(asked, modes, budget)?;
+                verdict.modes = search.verdicts(asked, modes, union, budget)?;
             }
         }
         Ok(verdict)
@@ -266,29 +266,37 @@ struct ActiveSearch<'a> {
 
 impl ActiveSearch<'_> {
     /// One verdict a mode of `asked`. What a few thrusters can do, more can do too, so the
-    /// dominating modes are searched first and their aborts are shared.
+    /// dominating modes are searched first and their aborts are shared; and a state outside the
+    /// sets of a few thrusters is outside those of more.
     fn verdicts(
         &self,
         asked: &[ThrustMode],
         dominating: &[ThrustMode],
+        union: &PolytopeUnion,
         budget: Budget<'_>,
     ) -> Result<Vec<ModeVerdict>, Interruption> {
-        let needed: Vec<ThrustMode> = dominating
-            .iter()
-            .copied()
-            .filter(|few| asked.iter().any(|mode| few.is_within(*mode)))
-            .collect();
-        let found =
-            needed.iter().map(|&mode| self.find(mode, budget)).collect::<Result<Vec<_>, _>>()?;
-        let doomed = self.doomed_after_s(asked);
+        let doomed = self.earliest(union, dominating.len());
+        let mut found: Vec<Option<AbortVerdict>> = vec![None; dominating.len()];
         let mut verdicts = Vec::with_capacity(asked.len());
-        for (&working, doomed_after_s) in asked.iter().zip(doomed) {
-            let itself = needed.iter().position(|&other| other == working);
-            let shared = (0..needed.len()).find(|&i| {
-                needed[i].is_within(working) && matches!(found[i], AbortVerdict::Found(_))
-            });
-            let abort = match itself.or(shared) {
-                Some(i) => found[i].clone(),
+        for &working in asked {
+            let fewer: Vec<usize> =
+                (0..dominating.len()).filter(|&i| dominating[i].is_within(working)).collect();
+            for &i in &fewer {
+                if found[i].is_none() {
+                    found[i] = Some(self.find(dominating[i], budget)?);
+                }
+            }
+            let itself = fewer.iter().copied().find(|&i| dominating[i] == working);
+            let shared = || {
+                fewer.iter().copied().find(|&i| matches!(found[i], Some(AbortVerdict::Found(_))))
+            };
+            let doomed_after_s = match itself {
+                Some(i) => doomed[i],
+                None if fewer.iter().any(|&i| doomed[i].is_none()) => None,
+                None => self.doomed_after_s(&[working], budget)?[0],
+            };
+            let abort = match itself.or_else(shared).and_then(|i| found[i].clone()) {
+                Some(abort) => abort,
                 None => self.find(working, budget)?,
             };
             verdicts.push(ModeVerdict { working, doomed_after_s, abort });
@@ -297,7 +305,11 @@ impl ActiveSearch<'_> {
     }
 
     /// Seconds until the earliest set of its own time index that holds the state, for each mode.
-    fn doomed_after_s(&self, modes: &[ThrustMode]) -> Vec<Option<f64>> {
+    fn doomed_after_s(
+        &self,
+        modes: &[ThrustMode],
+        budget: Budget<'_>,
+    ) -> Result<Vec<Option<f64>>, Interruption> {
         let plant = &self.judge.prepared.plant;
         let forces = self.judge.problem.thrusters.full_forces_n();
         let bits: Vec<u32> = modes.iter().map(|mode| mode.bits()).collect();
@@ -308,10 +320,17 @@ impl ActiveSearch<'_> {
             modes: &bits,
             horizon: self.horizon,
         };
-        let spacing_s = plant.sample_time().seconds() / plant.fraction_count() as f64;
         let start = self.k % plant.steps_per_period();
-        let mut doomed = vec![None; modes.len()];
-        for set in PolytopeUnion::new(&question, start..start + 1).sets(start) {
+        let union = PolytopeUnion::new(&question, start..start + 1, budget)?;
+        Ok(self.earliest(&union, modes.len()))
+    }
+
+    /// The same for the modes of a union.
+    fn earliest(&self, union: &PolytopeUnion, modes: usize) -> Vec<Option<f64>> {
+        let plant = &self.judge.prepared.plant;
+        let spacing_s = plant.sample_time().seconds() / plant.fraction_count() as f64;
+        let mut doomed = vec![None; modes];
+        for set in union.sets(self.k) {
             if doomed[set.mode].is_none() && set.contains(self.x) {
                 doomed[set.mode] = Some(set.instant as f64 * spacing_s);
             }

@@ -4,19 +4,23 @@ use nalgebra::Vector3;
 
 use super::{
     AbortReason, Arrival, Artifact, Command, Diagnostics, Fallback, Measurement, Phase, Problem,
-    State, Step, Trajectory, Verdict, artifact::PreparedPhase, cuts::Cuts, regulator::Regulator,
-    safety::Judge,
+    State, Step, Trajectory, UnsafeState, Verdict, artifact::PreparedPhase, cuts::Cuts,
+    regulator::Regulator, safety::Judge,
 };
 use crate::{
     budget::Budget,
     control::{
         Certificate, Claim, ConstraintFamily, ConstraintMargin, Failure, Fault, Infeasibility,
-        ProofRow, StepError,
+        ProofRow, Relaxation, StepError,
     },
     dynamics::RelativeVector,
     mission::ThrustMode,
-    program::{RegulatorAnswer, Softness, StateCut, Status},
+    program::{
+        CondensedRegulator, RegulatorAnswer, RegulatorProgram, RelaxedRows, Softness, StateCut,
+        Status,
+    },
     reach::Flight,
+    sets::ZonotopeFacets,
     units::Seconds,
 };
 
@@ -42,7 +46,19 @@ pub(super) fn step(
     let x = measured(problem, state, measurement)?;
     let (phase_index, distance_m) = phase_at(problem, state.phase, !state.is_aborting(), &x);
     let (phase, prepared) = artifact.phase(phase_index);
-    let here = Here { problem, phase, prepared, k: state.step, x, phase_index, distance_m, budget };
+    let mut here = Here {
+        problem,
+        phase,
+        prepared,
+        nominal: artifact.nominal_forces(),
+        k: state.step,
+        x,
+        phase_index,
+        distance_m,
+        unsafe_state: None,
+        budget,
+    };
+    here.unsafe_state = here.judge().unsafe_state(here.k, &x, budget)?;
     if let Some(under_way) = &state.abort {
         return here.go_on(under_way, measurement.working);
     }
@@ -57,6 +73,10 @@ pub(super) fn step(
     if failed && (phase.safety.watch().is_some() || working == ThrustMode::NONE) {
         return here.leave(working, AbortReason::Failure, None);
     }
+    if let (0, Some(unsafe_state)) = (state.step, &here.unsafe_state) {
+        let refused = here.unsafe_start(unsafe_state);
+        return Ok(here.without_command(Verdict::Infeasible(refused)));
+    }
     here.regulate(state, working)
 }
 
@@ -70,18 +90,18 @@ fn measured(
     x.fixed_rows_mut::<3>(0).copy_from(&measurement.state.position_m.components);
     x.fixed_rows_mut::<3>(3).copy_from(&measurement.state.velocity_m_s.components);
     if !x.iter().all(|c| c.is_finite()) {
-        faults.push(Fault::new("state", "finite numbers", "not so"));
+        faults.push(Fault::new("relative", "finite numbers", "not so"));
     }
     let step_s = problem.sample_time.seconds();
     if let Some(elapsed) = measurement.elapsed {
         let expected = state.step as f64 * step_s;
         if !((elapsed.seconds() - expected).abs() <= TIME_TOLERANCE * step_s) {
             let got = format!("{} s", elapsed.seconds());
-            faults.push(Fault::new("elapsed", format!("{expected} s"), got));
+            faults.push(Fault::new("elapsed_s", format!("{expected} s"), got));
         }
     }
     if measurement.working.is_some_and(|working| !working.is_within(problem.thrusters.nominal())) {
-        faults.push(Fault::new("working", "thrusters of the chaser", "another one"));
+        faults.push(Fault::new("working_thrusters", "thrusters of the chaser", "another one"));
     }
     if faults.is_empty() { Ok(x) } else { Err(StepError::Measurement(faults)) }
 }
@@ -116,10 +136,13 @@ pub(super) struct Here<'a> {
     pub(super) problem: &'a Problem,
     pub(super) phase: &'a Phase,
     pub(super) prepared: &'a PreparedPhase,
+    /// Forces of all thrusters.
+    pub(super) nominal: &'a ZonotopeFacets,
     pub(super) k: usize,
     pub(super) x: RelativeVector,
     pub(super) phase_index: usize,
     pub(super) distance_m: f64,
+    pub(super) unsafe_state: Option<UnsafeState>,
     pub(super) budget: Budget<'a>,
 }
 
@@ -130,7 +153,7 @@ impl Here<'_> {
         let start = regulator.received(&state.active);
         let answer = self.solve(&regulator, &cuts.cuts, None, &start)?;
         match answer.status {
-            Status::Optimal => self.command(&regulator, &cuts, &answer, false),
+            Status::Optimal => self.command(&regulator, &cuts, &answer, None),
             Status::PrimalInfeasible => self.without_trajectory(&regulator, &cuts, &answer),
             other => Err(Failure::Numerical(format!("the regulator ended {other:?}")).into()),
         }
@@ -142,7 +165,7 @@ impl Here<'_> {
         cuts: &Cuts,
         answer: &RegulatorAnswer,
     ) -> Result<Step, StepError> {
-        let infeasibility = self.infeasibility(regulator, answer);
+        let infeasibility = self.infeasibility(regulator, cuts, answer)?;
         match self.problem.fallback {
             Fallback::Abort => {
                 let nominal = self.problem.thrusters.nominal();
@@ -153,7 +176,7 @@ impl Here<'_> {
                 let softness = Some(Softness { linear: price, quadratic: price });
                 let soft = self.solve(regulator, &cuts.cuts, softness, &[])?;
                 if soft.status == Status::Optimal {
-                    return self.command(regulator, cuts, &soft, true);
+                    return self.command(regulator, cuts, &soft, Some(infeasibility));
                 }
                 Ok(self.without_command(Verdict::Infeasible(infeasibility)))
             }
@@ -168,9 +191,7 @@ impl Here<'_> {
         start: &[usize],
     ) -> Result<RegulatorAnswer, StepError> {
         let program = regulator.program(self, cuts, softness);
-        let condensed = program
-            .condense()
-            .map_err(|error| Failure::Numerical(format!("regulator: {error}")))?;
+        let condensed = condensed(&program)?;
         Ok(program.solve(&condensed, start, self.budget)?)
     }
 
@@ -186,17 +207,23 @@ impl Here<'_> {
         regulator: &Regulator,
         cuts: &Cuts,
         answer: &RegulatorAnswer,
-        softened: bool,
+        infeasibility: Option<Infeasibility>,
     ) -> Result<Step, StepError> {
+        let softened = infeasibility.is_some();
         let certificate = self.certify(regulator, cuts, answer, softened);
         if !certificate.passed {
             return Err(Failure::Numerical(format!("certificate: {certificate:?}")).into());
         }
         let watched = self.phase.safety.watch().is_some();
         let safety = watched.then(|| {
-            let judge = Judge { problem: self.problem, phase: self.phase, prepared: self.prepared };
             let modes = self.phase.safety.modes();
-            judge.verdict(self.phase_index, self.k + 1, &answer.states[1], modes, self.budget)
+            self.judge().verdict(
+                self.phase_index,
+                self.k + 1,
+                &answer.states[1],
+                modes,
+                self.budget,
+            )
         });
         let flight = Flight::under(&self.prepared.plant, self.k, &self.x, &answer.inputs);
         let violation = answer.violations.iter().fold(0.0_f64, |a, &b| a.max(b));
@@ -221,11 +248,13 @@ impl Here<'_> {
                 forces_n: answer.inputs.clone(),
             }),
             certificate: Some(certificate),
+            unsafe_state: self.unsafe_state,
             safety: safety.transpose()?,
             diagnostics: Diagnostics {
                 cuts: cuts.cuts.len(),
                 least_clearance: cuts.least_clearance,
                 violation,
+                infeasibility,
                 closest: Some(flight.closest_to_target()),
                 iterations: answer.iterations,
                 by_general_solver: answer.by_general_solver,
@@ -272,7 +301,15 @@ impl Here<'_> {
         }
     }
 
-    fn infeasibility(&self, regulator: &Regulator, answer: &RegulatorAnswer) -> Infeasibility {
+    /// The rows that rule out a trajectory, and the least change to half-spaces alone or to forces
+    /// alone that would allow one.
+    fn infeasibility(
+        &self,
+        regulator: &Regulator,
+        cuts: &Cuts,
+        answer: &RegulatorAnswer,
+    ) -> Result<Infeasibility, StepError> {
+        let horizon = self.problem.prediction_horizon;
         let total: f64 = answer.active.iter().map(|row| row.multiplier.abs()).sum();
         let mut rows: Vec<ProofRow> = answer
             .active
@@ -284,11 +321,53 @@ impl Here<'_> {
             })
             .collect();
         rows.sort_by(|a, b| b.weight.total_cmp(&a.weight));
-        Infeasibility {
+        let program = regulator.program(self, &cuts.cuts, None);
+        let condensed = condensed(&program)?;
+        let mut relaxations = Vec::new();
+        let families = [
+            (ConstraintFamily::State, RelaxedRows::Cuts),
+            (ConstraintFamily::Input, RelaxedRows::Facets),
+        ];
+        for (family, relaxed) in families {
+            let least = program.least_relaxation(&condensed, relaxed, self.budget)?;
+            relaxations.extend(least.map(|amount| Relaxation { family, horizon, amount }));
+        }
+        Ok(Infeasibility {
             reason: "no trajectory keeps out of every half-space".into(),
-            horizon: self.problem.prediction_horizon,
+            horizon,
             rows,
-            relaxations: Vec::new(),
+            relaxations,
+            all_horizons_proved: false,
+        })
+    }
+
+    /// A mission that starts where nothing could be survived is refused.
+    fn unsafe_start(&self, state: &UnsafeState) -> Infeasibility {
+        let (family, stage) = (ConstraintFamily::InitialState, 0);
+        let horizon = self.phase.safety.watch().map_or(0, |watch| watch.horizon);
+        let place = match &state.outside {
+            Some(x) => format!(
+                "outside, near by, is the position ({:.1}, {:.1}, {:.1}) m with the velocity \
+                 ({:.4}, {:.4}, {:.4}) m/s",
+                x[0], x[1], x[2], x[3], x[4], x[5]
+            ),
+            None => "no state near by is known to be outside: start farther out".into(),
+        };
+        let thrusters: Vec<String> = state.working.working().map(|j| j.to_string()).collect();
+        let failure = if thrusters.is_empty() {
+            "without thrust".to_owned()
+        } else {
+            format!("whatever the thrusters [{}] alone do", thrusters.join(", "))
+        };
+        Infeasibility {
+            reason: format!(
+                "the start is inside the unsafe set: {failure} the chaser is in the region of phase \
+                 {} after {} s; {place}",
+                self.phase_index, state.doomed_after_s
+            ),
+            horizon,
+            rows: vec![ProofRow { family, stage, row: state.instant, weight: 1.0 }],
+            relaxations: vec![Relaxation { family, horizon, amount: 1.0 - state.gauge }],
             all_horizons_proved: false,
         }
     }
@@ -301,6 +380,7 @@ impl Here<'_> {
             next: State { step: self.k + 1, phase: self.phase_index, ..State::START },
             trajectory: None,
             certificate: None,
+            unsafe_state: self.unsafe_state,
             safety: None,
             diagnostics: self.diagnostics(),
         }
@@ -312,15 +392,24 @@ impl Here<'_> {
             cuts: 0,
             least_clearance: f64::INFINITY,
             violation: 0.0,
+            infeasibility: None,
             closest: None,
             iterations: 0,
             by_general_solver: false,
         }
     }
 
+    pub(super) fn judge(&self) -> Judge<'_> {
+        Judge { problem: self.problem, phase: self.phase, prepared: self.prepared }
+    }
+
     fn elapsed(&self) -> Seconds {
         Seconds::from_seconds(self.k as f64 * self.problem.sample_time.seconds())
     }
+}
+
+fn condensed(program: &RegulatorProgram<'_>) -> Result<CondensedRegulator, Failure> {
+    program.condense().map_err(|error| Failure::Numerical(format!("regulator: {error}")))
 }
 
 fn tightest(family: ConstraintFamily) -> ConstraintMargin {

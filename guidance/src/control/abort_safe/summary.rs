@@ -26,8 +26,10 @@ pub struct Summary {
 /// One phase of a [`Summary`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct PhaseSummary {
-    /// Backward reachable sets that are not empty, over all starts.
+    /// Backward reachable sets that are not empty, over all starts, of the dominating modes.
     pub sets: usize,
+    /// Those that all modes that were asked for would have, if they were counted.
+    pub sets_of_all_modes: Option<usize>,
     /// Bytes of their numbers.
     pub size_bytes: usize,
     /// Modes whose sets hold those of all modes that were asked for.
@@ -58,10 +60,14 @@ impl Artifact {
     }
 
     fn phase_summary(&self, asked: &Phase, prepared: &PreparedPhase) -> PhaseSummary {
-        let (sets, size_bytes) = match &prepared.sets {
-            PhaseSets::None => (0, 0),
-            PhaseSets::Ellipsoids { union, .. } => (union.len(), union.size_bytes()),
-            PhaseSets::Polytopes { union, .. } => (union.len(), union.size_bytes()),
+        let (sets, sets_of_all_modes, size_bytes) = match &prepared.sets {
+            PhaseSets::None => (0, Some(0), 0),
+            PhaseSets::Ellipsoids { union, .. } => {
+                (union.len(), Some(union.len()), union.size_bytes())
+            }
+            PhaseSets::Polytopes { union, sets_of_all_modes, .. } => {
+                (union.len(), *sets_of_all_modes, union.size_bytes())
+            }
         };
         let fastest = self.problem().fastest_approach_m_s;
         let watch = asked.safety.watch();
@@ -69,6 +75,7 @@ impl Artifact {
             prepared.plant.sample_time().seconds() / prepared.plant.fraction_count() as f64;
         PhaseSummary {
             sets,
+            sets_of_all_modes,
             size_bytes,
             dominating_modes: dominating_modes(asked.safety.modes()),
             hides_approaches_above_m_s: watch

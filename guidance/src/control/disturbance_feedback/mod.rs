@@ -124,10 +124,14 @@ impl Controller for DisturbanceFeedback {
         plan(problem, budget)
     }
 
-    fn merge(problem: &Problem, shards: Vec<Plan>) -> Result<Plan, PrepareError> {
+    fn merge(
+        problem: &Problem,
+        shards: Vec<Plan>,
+        budget: Budget<'_>,
+    ) -> Result<Plan, PrepareError> {
         match shards.into_iter().next() {
             Some(plan) => Ok(plan),
-            None => plan(problem, Budget::UNLIMITED),
+            None => plan(problem, budget),
         }
     }
 

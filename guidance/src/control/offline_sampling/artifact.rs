@@ -1,31 +1,59 @@
 //! Everything that is known before flight.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
-use super::{Problem, encoding};
+use super::{Problem, Scheme, encoding};
 use crate::{
     bytes::{DecodeError, Reader, Writer},
+    dynamics::PlantMatrices,
+    matrices::times_vector,
     program::{DenseRows, QuadraticCost},
     reach::{HalfSpaces, StageGroup},
+    sampling::ScalarLaw,
 };
 
 /// The controller, ready to fly.
+///
+/// Its program is over the present state x and the decisions d: the corrections v_0 .. v_{T-1},
+/// and with [`Scheme::TubeRobust`] also e = x - z_0, where in the tube the state is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Artifact {
-    problem: Problem,
-    summary: Summary,
-    /// S over (x, v, 1).
-    cost: DMatrix<f64>,
-    /// D and then D_R, over (x, v).
-    rows: HalfSpaces,
-    /// Group of each row of D; none for D_R.
-    origins: Vec<Option<StageGroup>>,
-    /// {x : every successor of a feasible step lies here}.
-    first_step_set: HalfSpaces,
-    /// 2 S_vv, factored.
+    parts: Parts,
+    /// The plant at expected parameters.
+    mean: PlantMatrices,
+    /// B_w E[w] at expected parameters.
+    drift: DVector<f64>,
+    /// 2 S_dd, factored.
     quadratic: QuadraticCost,
     state_rows: DenseRows,
-    correction_rows: DenseRows,
+    decision_rows: DenseRows,
+}
+
+/// What an artifact is put together from.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Parts {
+    pub(super) problem: Problem,
+    pub(super) summary: Summary,
+    /// S over (x, d, 1).
+    pub(super) cost: DMatrix<f64>,
+    /// Over (x, d).
+    pub(super) rows: HalfSpaces,
+    /// One a row.
+    pub(super) origins: Vec<RowOrigin>,
+    pub(super) terminal_set: HalfSpaces,
+    /// {x : every successor of a feasible step lies here}.
+    pub(super) first_step_set: Option<HalfSpaces>,
+}
+
+/// Where a row of the program comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RowOrigin {
+    /// A constraint at a stage of the horizon.
+    Stage(StageGroup),
+    /// Every successor must lie in the first-step set.
+    FirstStep,
+    /// The state must lie in the tube.
+    Tube,
 }
 
 /// What came of a precompute.
@@ -37,130 +65,216 @@ pub struct Summary {
     pub terminal_weight: DMatrix<f64>,
     /// Rows of the terminal set.
     pub terminal_rows: usize,
-    /// Samples drawn, all groups together.
-    pub samples: usize,
-    /// Rows they made.
-    pub sampled_rows: usize,
-    /// Rows of D left.
-    pub kept_rows: usize,
+    /// Steps back until the terminal set stood.
+    pub terminal_iterations: usize,
+    /// What became of every group.
+    pub groups: Vec<GroupSummary>,
     /// Rows kept because no certificate for their removal was accepted.
     pub doubtful_rows: usize,
     /// Largest certified excess of a removed row, relative; with `InnerScaled` the kept rows were
     /// moved inwards by it.
     pub outer_excess: f64,
-    /// Rows of D_R that D does not imply.
+    /// Extreme points of kept rows, before they were moved, at which the removed ones were looked
+    /// at: those of each part of a group, and those of all parts together.
+    pub checked_points: usize,
+    /// Largest violation of a removed row at any of them, relative; it must not be larger than
+    /// `outer_excess`, which comes from certificates.
+    pub checked_excess: f64,
+    /// Rows of the first-step set's program that the others do not imply.
     pub first_step_rows: usize,
     /// The first-step set stopped at its limit of facets.
     pub first_step_limited: bool,
     /// All sampled sets are right together with at least this confidence; 0 says nothing, `None`
-    /// if the sample size was not taken from the bound.
+    /// if the sample size was not taken from the bound or nothing was sampled.
     pub joint_confidence: Option<f64>,
+    /// With [`Scheme::TubeRobust`].
+    pub tube: Option<TubeSummary>,
+}
+
+/// What became of the rows of a group.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GroupSummary {
+    /// Which.
+    pub group: StageGroup,
+    /// Samples drawn; 0 where nothing is sampled.
+    pub samples: usize,
+    /// Rows before any was removed.
+    pub rows: usize,
+    /// Rows left.
+    pub kept: usize,
+}
+
+/// The tube of [`Scheme::TubeRobust`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct TubeSummary {
+    /// Rows of the invariant set.
+    pub rows: usize,
+    /// Half widths of the box around it, n.
+    pub state_half_widths: DVector<f64>,
+    /// Half widths of the box around K times it, m.
+    pub input_half_widths: DVector<f64>,
+    /// Half widths of the box around all that acts on a step: disturbance, and the plant's
+    /// difference from the expected one anywhere in the state and input sets; n.
+    pub disturbance_half_widths: DVector<f64>,
+}
+
+impl Summary {
+    /// Samples drawn, all groups together.
+    #[must_use]
+    pub fn samples(&self) -> usize {
+        self.groups.iter().map(|group| group.samples).sum()
+    }
+
+    /// Rows before any was removed, without those of the first-step set.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.groups.iter().map(|group| group.rows).sum()
+    }
+
+    /// Rows left, without those of the first-step set.
+    #[must_use]
+    pub fn kept_rows(&self) -> usize {
+        self.groups.iter().map(|group| group.kept).sum()
+    }
 }
 
 impl Artifact {
     /// Puts the parts together; says what does not fit.
-    pub(super) fn assemble(
-        problem: Problem,
-        summary: Summary,
-        cost: DMatrix<f64>,
-        rows: HalfSpaces,
-        origins: Vec<Option<StageGroup>>,
-        first_step_set: HalfSpaces,
-    ) -> Result<Self, String> {
+    pub(super) fn assemble(parts: Parts) -> Result<Self, String> {
+        let Parts { problem, summary, cost, rows, origins, terminal_set, first_step_set } = &parts;
         let (n, m) = problem.dimensions();
-        let width = problem.horizon.saturating_mul(m);
-        if cost.shape() != (n + width + 1, n + width + 1)
-            || rows.dimension() != n + width
+        let decisions = problem.decisions();
+        let width = n.saturating_add(decisions);
+        if cost.shape() != (width + 1, width + 1)
+            || rows.dimension() != width
             || origins.len() != rows.len()
-            || first_step_set.dimension() != n
+            || terminal_set.dimension() != n
+            || first_step_set.as_ref().is_some_and(|set| set.dimension() != n)
             || summary.gain.shape() != (m, n)
+            || summary.tube.is_some() != (problem.scheme == Scheme::TubeRobust)
         {
             return Err("parts of different sizes".into());
         }
-        let quadratic = QuadraticCost::new(cost.view((n, n), (width, width)) * 2.0)
+        let quadratic = QuadraticCost::new(cost.view((n, n), (decisions, decisions)) * 2.0)
             .map_err(|error| error.to_string())?;
-        let (mut state_rows, mut correction_rows) = (DenseRows::new(n), DenseRows::new(width));
+        let (mut state_rows, mut decision_rows) = (DenseRows::new(n), DenseRows::new(decisions));
         for row in 0..rows.len() {
-            let (x, v) = rows.normal(row).split_at(n);
+            let (x, d) = rows.normal(row).split_at(n);
             state_rows.push(x);
-            correction_rows.push(v);
+            decision_rows.push(d);
         }
-        Ok(Self {
-            problem,
-            summary,
-            cost,
-            rows,
-            origins,
-            first_step_set,
-            quadratic,
-            state_rows,
-            correction_rows,
-        })
+        let mean = problem.plant.at_mean();
+        let expected = problem.disturbance.iter().map(ScalarLaw::mean);
+        let drift = DVector::from_iterator(problem.disturbance.len(), expected);
+        let drift = times_vector(&mean.b_w, &drift);
+        Ok(Self { mean, drift, quadratic, state_rows, decision_rows, parts })
     }
 
     /// The mission it was made for.
     #[must_use]
     pub fn problem(&self) -> &Problem {
-        &self.problem
+        &self.parts.problem
     }
 
     /// What came of the precompute.
     #[must_use]
     pub fn summary(&self) -> &Summary {
-        &self.summary
+        &self.parts.summary
     }
 
-    /// S of the expected cost z'S z, z = (x, v_0 .. v_{T-1}, 1). [Mammarella2019, eq. 7]
+    /// S of the expected cost z'S z, z = (x, d, 1). [Mammarella2019, eq. 7]
     #[must_use]
     pub fn expected_cost(&self) -> &DMatrix<f64> {
-        &self.cost
+        &self.parts.cost
     }
 
-    /// D and D_R over (x, v). [Mammarella2019, eqs. 13, 15]
+    /// The rows of the program, over (x, d). [Mammarella2019, eqs. 13, 15]
     #[must_use]
     pub fn rows(&self) -> &HalfSpaces {
-        &self.rows
+        &self.parts.rows
     }
 
-    /// Group of a row; `None` for the first-step rows.
+    /// Where a row comes from.
     #[must_use]
-    pub fn origin(&self, row: usize) -> Option<StageGroup> {
-        self.origins[row]
+    pub fn origin(&self, row: usize) -> RowOrigin {
+        self.parts.origins[row]
+    }
+
+    /// The terminal set, over x; with [`Scheme::TubeRobust`] that of the nominal trajectory.
+    #[must_use]
+    pub fn terminal_set(&self) -> &HalfSpaces {
+        &self.parts.terminal_set
     }
 
     /// The set that every successor lies in.
     #[must_use]
-    pub fn first_step_set(&self) -> &HalfSpaces {
-        &self.first_step_set
+    pub fn first_step_set(&self) -> Option<&HalfSpaces> {
+        self.parts.first_step_set.as_ref()
+    }
+
+    /// What is known about all sampled sets being right together, in a sentence.
+    #[must_use]
+    pub fn confidence_statement(&self) -> String {
+        let Summary { groups, joint_confidence, .. } = self.summary();
+        let Problem { scheme, samples, .. } = self.problem();
+        let (epsilon, delta) = (samples.violation, samples.confidence_complement);
+        match (scheme, joint_confidence) {
+            (Scheme::LinearQuadratic, _) => {
+                "nothing is sampled: constraints hold for the expected plant only".into()
+            }
+            (Scheme::TubeRobust, _) => {
+                "nothing is sampled: constraints hold for every plant in the hull of the vertices \
+                 and every disturbance in its bounds"
+                    .into()
+            }
+            (Scheme::OfflineSampling, None) => {
+                "the numbers of samples are not those of the bound for every group's own \
+                 variables: no confidence is proved"
+                    .into()
+            }
+            (Scheme::OfflineSampling, Some(joint)) => format!(
+                "each row of a group is right (violated with probability {epsilon} at most) with \
+                 confidence {}; all {} rows of {} groups together with confidence {joint}",
+                1.0 - delta,
+                self.problem().claims(self.terminal_set().len()),
+                groups.len()
+            ),
+        }
     }
 
     pub(super) fn quadratic(&self) -> &QuadraticCost {
         &self.quadratic
     }
 
-    pub(super) fn correction_rows(&self) -> &DenseRows {
-        &self.correction_rows
+    pub(super) fn decision_rows(&self) -> &DenseRows {
+        &self.decision_rows
     }
 
-    /// Gradient over v and offsets of the online program at x.
+    /// x after one step of the expected plant from x under u.
+    pub(super) fn expected_step(&self, x: &DVector<f64>, u: &DVector<f64>) -> DVector<f64> {
+        times_vector(&self.mean.a, x) + times_vector(&self.mean.b, u) + &self.drift
+    }
+
+    /// Gradient over d and offsets of the online program at x.
     pub(super) fn online(&self, x: &[f64]) -> (Vec<f64>, Vec<f64>) {
-        let (n, width) = (x.len(), self.correction_rows.columns());
-        let gradient = (0..width)
+        let (n, decisions) = (x.len(), self.decision_rows.columns());
+        let cost = &self.parts.cost;
+        let gradient = (0..decisions)
             .map(|i| {
-                let from_x: f64 = (0..n).map(|k| self.cost[(n + i, k)] * x[k]).sum();
-                2.0 * (from_x + self.cost[(n + i, n + width)])
+                let from_x: f64 = (0..n).map(|k| cost[(n + i, k)] * x[k]).sum();
+                2.0 * (from_x + cost[(n + i, n + decisions)])
             })
             .collect();
-        let mut moved = Vec::with_capacity(self.rows.len());
+        let mut moved = Vec::with_capacity(self.parts.rows.len());
         self.state_rows.products(x, &mut moved);
-        let offsets = self.rows.offsets().iter().zip(&moved).map(|(h, hx)| h - hx).collect();
+        let offsets = self.parts.rows.offsets().iter().zip(&moved).map(|(h, hx)| h - hx).collect();
         (gradient, offsets)
     }
 
-    /// z'S z at (x, v).
-    pub(super) fn expected_cost_at(&self, x: &[f64], v: &[f64]) -> f64 {
-        let z: Vec<f64> = x.iter().chain(v).copied().chain([1.0]).collect();
-        let row = |i: usize| -> f64 { (0..z.len()).map(|k| self.cost[(i, k)] * z[k]).sum() };
+    /// z'S z at (x, d).
+    pub(super) fn expected_cost_at(&self, x: &[f64], d: &[f64]) -> f64 {
+        let z: Vec<f64> = x.iter().chain(d).copied().chain([1.0]).collect();
+        let row = |i: usize| -> f64 { (0..z.len()).map(|k| self.parts.cost[(i, k)] * z[k]).sum() };
         (0..z.len()).map(|i| z[i] * row(i)).sum()
     }
 
@@ -168,14 +282,7 @@ impl Artifact {
     #[must_use]
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut writer = Writer::default();
-        encoding::write_problem(&mut writer, &self.problem);
-        encoding::write_summary(&mut writer, &self.summary);
-        writer.matrix(&self.cost);
-        encoding::write_half_spaces(&mut writer, &self.rows);
-        for origin in &self.origins {
-            encoding::write_origin(&mut writer, *origin);
-        }
-        encoding::write_half_spaces(&mut writer, &self.first_step_set);
+        encoding::write_parts(&mut writer, &self.parts);
         writer.finish()
     }
 
@@ -185,18 +292,11 @@ impl Artifact {
     /// [`DecodeError`] for anything else.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(bytes);
-        let problem = encoding::read_problem(&mut reader)?;
-        let summary = encoding::read_summary(&mut reader)?;
-        let cost = reader.matrix()?;
-        let rows = encoding::read_half_spaces(&mut reader)?;
-        let origins = (0..rows.len()).map(|_| encoding::read_origin(&mut reader));
-        let origins = origins.collect::<Result<_, _>>()?;
-        let first_step_set = encoding::read_half_spaces(&mut reader)?;
+        let parts = encoding::read_parts(&mut reader)?;
         reader.end()?;
-        if let Some(fault) = problem.faults().first() {
+        if let Some(fault) = parts.problem.faults().first() {
             return Err(reader.fault(format!("{}: {}", fault.field, fault.got)));
         }
-        Self::assemble(problem, summary, cost, rows, origins, first_step_set)
-            .map_err(|text| reader.fault(text))
+        Self::assemble(parts).map_err(|text| reader.fault(text))
     }
 }

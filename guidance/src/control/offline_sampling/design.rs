@@ -1,208 +1,114 @@
-//! What is computed before flight, in shards.
+//! What every scheme needs before flight: gain, weights, the plant's vertices, the terminal set.
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{Artifact, Problem, Redundancy, Summary, problem::GainChoice};
+use super::{
+    Artifact, GainChoice, GroupSummary, Problem, Scheme, Summary, artifact::Parts, terminal,
+};
 use crate::{
     budget::Budget,
     control::{Failure, Fault, Infeasibility, PrepareError},
     dynamics::{
-        ExpectedCost, PlantMatrices, StageWeights, linear_quadratic_regulator, spectral_radius,
-        terminal_cost,
+        PlantMatrices, StageWeights, linear_quadratic_regulator, spectral_radius, terminal_cost,
     },
     matrices::product,
-    reach::{
-        EXACT, GrowthError, HalfSpaces, Invariant, NoInterior, PlantVertex, SampledRows, Scenario,
-        StageConstraints, StageGroup, grow_control_invariant, irredundant,
-        max_robust_positive_invariant, step_back,
-    },
-    sampling::{ScalarLaw, Stream, failure_of_any},
+    reach::{HalfSpaces, NoInterior, PlantVertex, StageConstraints, StageGroup},
+    sampling::{ScalarLaw, Stream},
     sets::Zonotope,
 };
 
-/// Stream of the samples of the expected cost, apart from those of the groups.
-const COST_STREAM: u64 = u64::MAX;
-/// Stream of the samples of the terminal weight.
+/// Stream of the samples of the terminal weight, apart from those of the groups.
 const TERMINAL_STREAM: u64 = u64::MAX - 1;
 
-/// Part of an artifact.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Shard {
-    /// The rows of one group that are needed beside the context.
-    Rows(SampledRows),
-    /// The expected cost.
-    Cost(ExpectedCost),
-}
-
-/// What every shard needs: cheap to make again.
-struct Design {
-    gain: DMatrix<f64>,
-    weights: StageWeights,
-    vertices: Vec<PlantMatrices>,
+/// What every part of a precompute needs: cheap to make again.
+pub(super) struct Design {
+    pub(super) gain: DMatrix<f64>,
+    pub(super) weights: StageWeights,
+    pub(super) vertices: Vec<PlantMatrices>,
     /// B_w W at each vertex.
-    images: Vec<Zonotope>,
-    constraints: StageConstraints,
-    groups: Vec<StageGroup>,
-    sizes: Vec<usize>,
+    pub(super) images: Vec<Zonotope>,
+    pub(super) constraints: StageConstraints,
+    pub(super) terminal_iterations: usize,
+    pub(super) groups: Vec<StageGroup>,
 }
 
 impl Design {
-    fn new(problem: &Problem, budget: Budget<'_>) -> Result<Self, PrepareError> {
-        let faults = problem.faults();
-        if !faults.is_empty() {
-            return Err(PrepareError::Faults(faults));
-        }
-        let gain = gain(problem)?;
-        let vertices = vertices(problem)?;
-        for vertex in &vertices {
-            let radius = spectral_radius(&(&vertex.a + product(&vertex.b, &gain)));
-            if !(radius < 1.0) {
-                let expected = "a gain that stabilises every vertex of the plant";
-                let fault = Fault::new("gain", expected, format!("spectral radius {radius}"));
-                return Err(PrepareError::Faults(vec![fault]));
-            }
-        }
-        let images = images(problem, &vertices);
-        let terminal = terminal_set(problem, &gain, &vertices, &images, budget)?;
-        let weights = weights(problem, &gain)?;
+    /// For a scheme without a tube: with all vertices and every disturbance, or with the expected
+    /// ones alone.
+    ///
+    /// # Errors
+    /// As [`super::Controller::run_shard`].
+    pub(super) fn new(problem: &Problem, budget: Budget<'_>) -> Result<Self, PrepareError> {
+        let gain = checked_gain(problem)?;
+        let robust = problem.scheme == Scheme::OfflineSampling;
+        let vertices = if robust { vertices(problem)? } else { vec![problem.plant.at_mean()] };
+        let all = if robust { disturbance(problem) } else { expected_disturbance(problem) };
+        let state = HalfSpaces::from_polytope(&problem.state_set);
+        let input = HalfSpaces::from_polytope(&problem.input_set);
+        Self::within(problem, gain, vertices, &all, (state, input), budget)
+    }
+
+    /// For a gain, plants and disturbances of the caller, in his state and input constraints.
+    pub(super) fn within(
+        problem: &Problem,
+        gain: DMatrix<f64>,
+        vertices: Vec<PlantMatrices>,
+        disturbance: &Zonotope,
+        (state, input): (HalfSpaces, HalfSpaces),
+        budget: Budget<'_>,
+    ) -> Result<Self, PrepareError> {
+        check_stable(problem, &vertices, &gain)?;
+        let images: Vec<Zonotope> =
+            vertices.iter().map(|vertex| disturbance.linear_map(&vertex.b_w)).collect();
+        let closed = plant_vertices(&gain, &vertices, &images, false);
+        let limits = problem.terminal_limits;
+        let found = terminal::terminal_set(&state, &input, &gain, &closed, limits, budget)?;
         Ok(Self {
-            weights,
-            images,
-            constraints: StageConstraints {
-                state: HalfSpaces::from_polytope(&problem.state_set),
-                input: HalfSpaces::from_polytope(&problem.input_set),
-                terminal,
-            },
+            weights: weights(problem, &gain)?,
+            constraints: StageConstraints { state, input, terminal: found.set },
+            terminal_iterations: found.iterations,
             groups: problem.groups(),
-            sizes: problem.sizes(),
             gain,
             vertices,
+            images,
         })
     }
 
-    fn scenario<'a>(&'a self, problem: &'a Problem) -> Scenario<'a> {
-        Scenario {
-            plant: &problem.plant,
-            disturbance: &problem.disturbance,
-            gain: &self.gain,
-            horizon: problem.horizon,
-            constraints: &self.constraints,
-            groups: &self.groups,
-            sizes: &self.sizes,
-            seed: problem.seed,
-        }
-    }
-
-    fn plant_vertices(&self, with_input: bool) -> Vec<PlantVertex<'_>> {
+    pub(super) fn plant_vertices(&self, with_input: bool) -> Vec<PlantVertex<'_>> {
         plant_vertices(&self.gain, &self.vertices, &self.images, with_input)
     }
-}
 
-pub(super) fn run_shard(
-    problem: &Problem,
-    shard: usize,
-    budget: Budget<'_>,
-) -> Result<Shard, PrepareError> {
-    let design = Design::new(problem, budget)?;
-    let scenario = design.scenario(problem);
-    if shard < design.groups.len() {
-        let context = scenario.context(budget).map_err(|reason| no_set(&reason))?;
-        let rows = scenario.survivors(shard, &context, budget);
-        return rows.map(Shard::Rows).map_err(|reason| no_set(&reason));
-    }
-    let (n, m) = problem.dimensions();
-    let mut cost = ExpectedCost::new(n + problem.horizon * m + 1);
-    for sample in 0..problem.weights.samples {
-        budget.check()?;
-        let prediction = scenario.prediction(COST_STREAM, sample, problem.horizon);
-        cost.add(&prediction, &design.weights);
-    }
-    Ok(Shard::Cost(cost))
-}
-
-pub(super) fn merge(problem: &Problem, shards: &[Shard]) -> Result<Artifact, PrepareError> {
-    let budget = Budget::UNLIMITED;
-    let design = Design::new(problem, budget)?;
-    let scenario = design.scenario(problem);
-    let context = scenario.context(budget).map_err(|reason| no_set(&reason))?;
-    let mut survivors = Vec::new();
-    let mut cost = None;
-    for shard in shards {
-        match shard {
-            Shard::Rows(rows) => survivors.push(rows.clone()),
-            Shard::Cost(part) => cost = Some(part.mean()),
+    /// A summary without anything sampled or removed.
+    pub(super) fn summary(&self, groups: Vec<GroupSummary>) -> Summary {
+        Summary {
+            gain: self.gain.clone(),
+            terminal_weight: self.weights.terminal.clone(),
+            terminal_rows: self.constraints.terminal.len(),
+            terminal_iterations: self.terminal_iterations,
+            groups,
+            doubtful_rows: 0,
+            outer_excess: 0.0,
+            checked_points: 0,
+            checked_excess: 0.0,
+            first_step_rows: 0,
+            first_step_limited: false,
+            joint_confidence: None,
+            tube: None,
         }
     }
-    let (Some(cost), true) = (cost, survivors.len() == design.groups.len()) else {
-        return Err(Failure::Numerical("shards are missing".into()).into());
-    };
-    let tolerance = match problem.redundancy {
-        Redundancy::Exact => EXACT,
-        Redundancy::InnerScaled { epsilon } => epsilon,
-    };
-    let (sampled, reduction) = Scenario::merged(&context, &survivors, tolerance, budget)
-        .map_err(|reason| no_set(&reason))?;
-    let (first_step, grown) = first_step_rows(problem, &design, &sampled.rows)?;
-    let claims = problem.claims(design.constraints.terminal.len());
-    let summary = Summary {
-        terminal_rows: design.constraints.terminal.len(),
-        sampled_rows: scenario.row_count(),
-        kept_rows: sampled.rows.len(),
-        doubtful_rows: reduction.doubtful,
-        outer_excess: reduction.outer_excess,
-        first_step_rows: first_step.len(),
-        first_step_limited: grown.1,
-        samples: design.sizes.iter().sum(),
-        joint_confidence: problem
-            .samples
-            .size
-            .is_none()
-            .then(|| 1.0 - failure_of_any(claims, problem.samples.confidence_complement)),
-        gain: design.gain,
-        terminal_weight: design.weights.terminal,
-    };
-    let origins = sampled.groups.iter().map(|&group| Some(design.groups[group]));
-    let origins = origins.chain(std::iter::repeat_n(None, first_step.len())).collect();
-    let mut rows = sampled.rows;
-    rows.extend(&first_step);
-    Artifact::assemble(problem.clone(), summary, cost, rows, origins, grown.0)
-        .map_err(|text| Failure::Numerical(text).into())
 }
 
-/// D_R: every successor lies in the grown set; without rows that D makes redundant.
-/// [Mammarella2019, eq. 15]
-fn first_step_rows(
-    problem: &Problem,
-    design: &Design,
-    sampled: &HalfSpaces,
-) -> Result<(HalfSpaces, (HalfSpaces, bool)), PrepareError> {
-    let budget = Budget::UNLIMITED;
-    let vertices = design.plant_vertices(true);
-    let growth = grow_control_invariant(
-        &design.constraints.terminal,
-        sampled,
-        &vertices,
-        problem.growth,
-        budget,
-    )
-    .map_err(|error| match error {
-        GrowthError::Seed(reason) => no_set(&reason),
-        GrowthError::Interrupted(why) => why.into(),
-        other => Failure::Numerical(format!("the first-step set: {other:?}")).into(),
-    })?;
-    let mut rows = HalfSpaces::new(sampled.dimension());
-    let mut normal = vec![0.0; sampled.dimension()];
-    let successors = step_back(&growth.set, &vertices);
-    for row in 0..successors.len() {
-        let known = successors.normal(row);
-        normal[..known.len()].copy_from_slice(known);
-        rows.push(&normal, successors.offset(row));
+/// An artifact, or ours is the fault.
+pub(super) fn assembled(parts: Parts) -> Result<Artifact, PrepareError> {
+    Artifact::assemble(parts).map_err(|text| Failure::Numerical(text).into())
+}
+
+/// K of a problem without faults.
+pub(super) fn checked_gain(problem: &Problem) -> Result<DMatrix<f64>, PrepareError> {
+    let faults = problem.faults();
+    if !faults.is_empty() {
+        return Err(PrepareError::Faults(faults));
     }
-    let kept = irredundant(&rows, sampled, EXACT, budget).map_err(|reason| no_set(&reason))?.kept;
-    Ok((rows.select(&kept), (growth.set, growth.limited)))
-}
-
-fn gain(problem: &Problem) -> Result<DMatrix<f64>, PrepareError> {
     match &problem.gain {
         GainChoice::Explicit(gain) => Ok(gain.clone()),
         GainChoice::Lqr { state, input } => {
@@ -215,7 +121,8 @@ fn gain(problem: &Problem) -> Result<DMatrix<f64>, PrepareError> {
     }
 }
 
-fn vertices(problem: &Problem) -> Result<Vec<PlantMatrices>, PrepareError> {
+/// Plants whose hull holds every plant.
+pub(super) fn vertices(problem: &Problem) -> Result<Vec<PlantMatrices>, PrepareError> {
     let given = problem.vertices.clone().filter(|vertices| !vertices.is_empty());
     given.or_else(|| problem.plant.corners()).ok_or_else(|| {
         let expected = "given vertices where more than twelve parameters vary";
@@ -223,13 +130,44 @@ fn vertices(problem: &Problem) -> Result<Vec<PlantMatrices>, PrepareError> {
     })
 }
 
-/// B_w W at each vertex, W the box of the laws' ranges.
-fn images(problem: &Problem, vertices: &[PlantMatrices]) -> Vec<Zonotope> {
-    let ranges: Vec<(f64, f64)> = problem.disturbance.iter().map(ScalarLaw::range).collect();
-    let centre = DVector::from_iterator(ranges.len(), ranges.iter().map(|r| 0.5 * (r.0 + r.1)));
-    let half = DVector::from_iterator(ranges.len(), ranges.iter().map(|r| 0.5 * (r.1 - r.0)));
-    let all = Zonotope::new(centre, DMatrix::from_diagonal(&half));
-    vertices.iter().map(|vertex| all.linear_map(&vertex.b_w)).collect()
+/// Refuses a gain under which a vertex is not stable, and names every such vertex.
+fn check_stable(
+    problem: &Problem,
+    vertices: &[PlantMatrices],
+    gain: &DMatrix<f64>,
+) -> Result<(), PrepareError> {
+    let unstable = |(index, vertex): (usize, &PlantMatrices)| {
+        let radius = spectral_radius(&(&vertex.a + product(&vertex.b, gain)));
+        (!(radius < 1.0)).then(|| {
+            let given = problem.vertices.as_ref().is_some_and(|given| !given.is_empty());
+            let field = if given { format!("vertices[{index}]") } else { "gain".into() };
+            let expected = "a gain that stabilises every vertex of the plant";
+            let got =
+                format!("spectral radius {radius} at vertex {index} of {} from 0", vertices.len());
+            Fault::new(field, expected, got)
+        })
+    };
+    let faults: Vec<Fault> = vertices.iter().enumerate().filter_map(unstable).collect();
+    if faults.is_empty() { Ok(()) } else { Err(PrepareError::Faults(faults)) }
+}
+
+/// W, the box of the laws' ranges about their means.
+pub(super) fn disturbance(problem: &Problem) -> Zonotope {
+    let laws = &problem.disturbance;
+    let half = |law: &ScalarLaw| {
+        let ((low, high), mean) = (law.range(), law.mean());
+        f64::max(high - mean, mean - low)
+    };
+    let centre = DVector::from_iterator(laws.len(), laws.iter().map(ScalarLaw::mean));
+    let half = DVector::from_iterator(laws.len(), laws.iter().map(half));
+    Zonotope::new(centre, DMatrix::from_diagonal(&half))
+}
+
+/// {E[w]}.
+pub(super) fn expected_disturbance(problem: &Problem) -> Zonotope {
+    let centre = disturbance(problem).centre().clone();
+    let none = DMatrix::zeros(centre.len(), 0);
+    Zonotope::new(centre, none)
 }
 
 fn plant_vertices<'a>(
@@ -246,42 +184,18 @@ fn plant_vertices<'a>(
     vertices.iter().zip(images).map(vertex).collect()
 }
 
-/// The largest robust invariant set of u = K x in the state and input constraints.
-fn terminal_set(
-    problem: &Problem,
-    gain: &DMatrix<f64>,
-    vertices: &[PlantMatrices],
-    images: &[Zonotope],
-    budget: Budget<'_>,
-) -> Result<HalfSpaces, PrepareError> {
-    let mut rows = HalfSpaces::from_polytope(&problem.state_set);
-    let fed_back = product(problem.input_set.normals(), gain);
-    for (row, offset) in fed_back.row_iter().zip(problem.input_set.offsets().iter()) {
-        rows.push(&row.iter().copied().collect::<Vec<_>>(), *offset);
-    }
-    let vertices = plant_vertices(gain, vertices, images, false);
-    match max_robust_positive_invariant(&rows, &vertices, problem.terminal_limits, budget) {
-        Invariant::Found { set, .. } => Ok(set),
-        Invariant::Interrupted(why) => Err(why.into()),
-        Invariant::Empty { iterations, .. } => Err(infeasible(format!(
-            "no set around the target stays in the constraints under the gain: nothing is \
-                 left after {iterations} steps back"
-        ))),
-        Invariant::Undecided { iterations, rows } => {
-            let got = format!("undecided after {iterations} steps back with {rows} rows");
-            let expected = "limits under which the terminal set is found or excluded";
-            Err(PrepareError::Faults(vec![Fault::new("terminal_limits", expected, got)]))
-        }
-    }
-}
-
+/// Q, R, and P with equality in [Mammarella2019, eq. 3]: over samples of the plant, or for the
+/// expected plant where nothing is sampled.
 fn weights(problem: &Problem, gain: &DMatrix<f64>) -> Result<StageWeights, PrepareError> {
-    let closed_loop = |sample: usize| {
+    let closed_loop = |step: PlantMatrices| step.a + product(&step.b, gain);
+    let sampled = |sample: usize| {
         let mut stream = Stream::new(problem.seed, TERMINAL_STREAM, sample as u64);
-        let step = problem.plant.draw(&mut stream);
-        step.a + product(&step.b, gain)
+        closed_loop(problem.plant.draw(&mut stream))
     };
-    let loops: Vec<DMatrix<f64>> = (0..problem.weights.samples).map(closed_loop).collect();
+    let loops: Vec<DMatrix<f64>> = match problem.scheme {
+        Scheme::OfflineSampling => (0..problem.weights.samples).map(sampled).collect(),
+        Scheme::LinearQuadratic | Scheme::TubeRobust => vec![closed_loop(problem.plant.at_mean())],
+    };
     let (state, input) = (problem.weights.state.clone(), problem.weights.input.clone());
     let terminal = terminal_cost(&state, &input, gain, &loops).map_err(|error| {
         let expected = "a gain that is stable in the mean square";
@@ -290,22 +204,22 @@ fn weights(problem: &Problem, gain: &DMatrix<f64>) -> Result<StageWeights, Prepa
     Ok(StageWeights { state, input, terminal })
 }
 
-fn no_set(reason: &NoInterior) -> PrepareError {
+pub(super) fn no_set(reason: &NoInterior) -> PrepareError {
     match reason {
         NoInterior::Interrupted(why) => (*why).into(),
         NoInterior::Numerical => {
-            Failure::Numerical("no interior point of the sampled set".into()).into()
+            Failure::Numerical("no interior point of the constraints' set".into()).into()
         }
         NoInterior::Empty { margin, .. } => infeasible(format!(
-            "no state and corrections satisfy all samples: they miss by {margin}"
+            "no state and corrections satisfy all constraints: they miss by {margin}"
         )),
         NoInterior::Flat { room } => {
-            infeasible(format!("the sampled set leaves no room: largest ball {room}"))
+            infeasible(format!("the constraints leave no room: largest ball {room}"))
         }
     }
 }
 
-fn infeasible(reason: String) -> PrepareError {
+pub(super) fn infeasible(reason: String) -> PrepareError {
     PrepareError::Infeasible(Infeasibility {
         reason,
         horizon: 0,

@@ -1,6 +1,9 @@
 //! Canonical bytes of a problem: equal problems, equal bytes; also how artifacts keep them.
 
-use super::{CostWeights, GainChoice, Problem, Redundancy, SampleChoice, Summary};
+use super::{
+    Coordinates, CostWeights, GainChoice, GroupSummary, Problem, Redundancy, RowOrigin,
+    SampleChoice, Scheme, Summary, TubeSummary, artifact::Parts,
+};
 use crate::{
     bytes::{DecodeError, Reader, Writer},
     dynamics::{Discretisation, MatrixPolynomial, Monomial, PlantMatrices, UncertainPlant},
@@ -20,7 +23,17 @@ impl Problem {
 }
 
 pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
+    writer.tag(match problem.scheme {
+        Scheme::OfflineSampling => 1,
+        Scheme::LinearQuadratic => 2,
+        Scheme::TubeRobust => 3,
+    });
     write_plant(writer, &problem.plant);
+    writer.tag(match problem.coordinates {
+        Coordinates::General => 1,
+        Coordinates::Planar => 2,
+        Coordinates::Rtn => 3,
+    });
     writer.option(problem.vertices.as_ref(), |writer, vertices| {
         writer.count(vertices.len());
         for vertex in vertices {
@@ -54,6 +67,7 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
     writer.option(problem.samples.variables, Writer::count);
     writer.option(problem.samples.size, Writer::count);
     writer.tag(u8::from(problem.samples.state_at_start));
+    writer.count(problem.samples.rows_max);
     match problem.redundancy {
         Redundancy::Exact => writer.tag(1),
         Redundancy::InnerScaled { epsilon } => {
@@ -63,14 +77,28 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
     }
     writer.count(problem.terminal_limits.iterations_max);
     writer.count(problem.terminal_limits.rows_max);
-    writer.count(problem.growth.rounds);
-    writer.count(problem.growth.directions);
-    writer.count(problem.growth.facets_max);
+    writer.option(problem.first_step, |writer, limits| {
+        writer.count(limits.rounds);
+        writer.count(limits.directions);
+        writer.count(limits.facets_max);
+    });
     writer.bytes(&problem.seed.to_le_bytes());
 }
 
 pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeError> {
+    let scheme = match reader.tag()? {
+        1 => Scheme::OfflineSampling,
+        2 => Scheme::LinearQuadratic,
+        3 => Scheme::TubeRobust,
+        other => return Err(unknown(reader, "scheme", other)),
+    };
     let plant = read_plant(reader)?;
+    let coordinates = match reader.tag()? {
+        1 => Coordinates::General,
+        2 => Coordinates::Planar,
+        3 => Coordinates::Rtn,
+        other => return Err(unknown(reader, "coordinates", other)),
+    };
     let vertices = reader.option(|reader| {
         let count = reader.count()?;
         let vertex = |reader: &mut Reader<'_>| -> Result<PlantMatrices, DecodeError> {
@@ -101,6 +129,7 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         variables: reader.option(Reader::count)?,
         size: reader.option(Reader::count)?,
         state_at_start: read_flag(reader)?,
+        rows_max: reader.count()?,
     };
     let redundancy = match reader.tag()? {
         1 => Redundancy::Exact,
@@ -108,7 +137,9 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         other => return Err(unknown(reader, "redundancy", other)),
     };
     Ok(Problem {
+        scheme,
         plant,
+        coordinates,
         vertices,
         disturbance,
         horizon,
@@ -122,50 +153,115 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
             iterations_max: reader.count()?,
             rows_max: reader.count()?,
         },
-        growth: GrowthLimits {
-            rounds: reader.count()?,
-            directions: reader.count()?,
-            facets_max: reader.count()?,
-        },
+        first_step: reader.option(|reader| {
+            Ok(GrowthLimits {
+                rounds: reader.count()?,
+                directions: reader.count()?,
+                facets_max: reader.count()?,
+            })
+        })?,
         seed: read_seed(reader)?,
     })
 }
 
-pub(super) fn write_summary(writer: &mut Writer, summary: &Summary) {
+pub(super) fn write_parts(writer: &mut Writer, parts: &Parts) {
+    write_problem(writer, &parts.problem);
+    write_summary(writer, &parts.summary);
+    writer.matrix(&parts.cost);
+    write_half_spaces(writer, &parts.rows);
+    for origin in &parts.origins {
+        match *origin {
+            RowOrigin::FirstStep => writer.tag(4),
+            RowOrigin::Tube => writer.tag(5),
+            RowOrigin::Stage(group) => write_group(writer, group),
+        }
+    }
+    write_half_spaces(writer, &parts.terminal_set);
+    writer.option(parts.first_step_set.as_ref(), write_half_spaces);
+}
+
+pub(super) fn read_parts(reader: &mut Reader<'_>) -> Result<Parts, DecodeError> {
+    let problem = read_problem(reader)?;
+    let summary = read_summary(reader)?;
+    let cost = reader.matrix()?;
+    let rows = read_half_spaces(reader)?;
+    let origin = |reader: &mut Reader<'_>| match reader.tag()? {
+        4 => Ok(RowOrigin::FirstStep),
+        5 => Ok(RowOrigin::Tube),
+        family => read_group(reader, family).map(RowOrigin::Stage),
+    };
+    let origins = (0..rows.len()).map(|_| origin(reader)).collect::<Result<_, _>>()?;
+    let terminal_set = read_half_spaces(reader)?;
+    let first_step_set = reader.option(read_half_spaces)?;
+    Ok(Parts { problem, summary, cost, rows, origins, terminal_set, first_step_set })
+}
+
+fn write_summary(writer: &mut Writer, summary: &Summary) {
     writer.matrix(&summary.gain);
     writer.matrix(&summary.terminal_weight);
+    writer.count(summary.groups.len());
+    for group in &summary.groups {
+        write_group(writer, group.group);
+        [group.samples, group.rows, group.kept].into_iter().for_each(|count| writer.count(count));
+    }
     for count in [
         summary.terminal_rows,
-        summary.samples,
-        summary.sampled_rows,
-        summary.kept_rows,
+        summary.terminal_iterations,
         summary.doubtful_rows,
+        summary.checked_points,
         summary.first_step_rows,
     ] {
         writer.count(count);
     }
     writer.number(summary.outer_excess);
+    writer.number(summary.checked_excess);
     writer.tag(u8::from(summary.first_step_limited));
     writer.option(summary.joint_confidence, Writer::number);
+    writer.option(summary.tube.as_ref(), |writer, tube| {
+        writer.count(tube.rows);
+        writer.numbers(tube.state_half_widths.as_slice());
+        writer.numbers(tube.input_half_widths.as_slice());
+        writer.numbers(tube.disturbance_half_widths.as_slice());
+    });
 }
 
-pub(super) fn read_summary(reader: &mut Reader<'_>) -> Result<Summary, DecodeError> {
+fn read_summary(reader: &mut Reader<'_>) -> Result<Summary, DecodeError> {
+    let (gain, terminal_weight) = (reader.matrix()?, reader.matrix()?);
+    let count = reader.count()?;
+    let group = |reader: &mut Reader<'_>| {
+        let family = reader.tag()?;
+        Ok(GroupSummary {
+            group: read_group(reader, family)?,
+            samples: reader.count()?,
+            rows: reader.count()?,
+            kept: reader.count()?,
+        })
+    };
     Ok(Summary {
-        gain: reader.matrix()?,
-        terminal_weight: reader.matrix()?,
+        gain,
+        terminal_weight,
+        groups: (0..count).map(|_| group(reader)).collect::<Result<_, _>>()?,
         terminal_rows: reader.count()?,
-        samples: reader.count()?,
-        sampled_rows: reader.count()?,
-        kept_rows: reader.count()?,
+        terminal_iterations: reader.count()?,
         doubtful_rows: reader.count()?,
+        checked_points: reader.count()?,
         first_step_rows: reader.count()?,
         outer_excess: reader.number()?,
+        checked_excess: reader.number()?,
         first_step_limited: read_flag(reader)?,
         joint_confidence: reader.option(Reader::number)?,
+        tube: reader.option(|reader| {
+            Ok(TubeSummary {
+                rows: reader.count()?,
+                state_half_widths: reader.vector()?,
+                input_half_widths: reader.vector()?,
+                disturbance_half_widths: reader.vector()?,
+            })
+        })?,
     })
 }
 
-pub(super) fn write_half_spaces(writer: &mut Writer, rows: &HalfSpaces) {
+fn write_half_spaces(writer: &mut Writer, rows: &HalfSpaces) {
     writer.count(rows.dimension());
     writer.numbers(rows.offsets());
     for row in 0..rows.len() {
@@ -173,7 +269,7 @@ pub(super) fn write_half_spaces(writer: &mut Writer, rows: &HalfSpaces) {
     }
 }
 
-pub(super) fn read_half_spaces(reader: &mut Reader<'_>) -> Result<HalfSpaces, DecodeError> {
+fn read_half_spaces(reader: &mut Reader<'_>) -> Result<HalfSpaces, DecodeError> {
     let dimension = reader.count()?;
     if dimension > 100_000 {
         return Err(reader.fault("too many coordinates"));
@@ -187,8 +283,7 @@ pub(super) fn read_half_spaces(reader: &mut Reader<'_>) -> Result<HalfSpaces, De
     Ok(rows)
 }
 
-pub(super) fn write_origin(writer: &mut Writer, origin: Option<StageGroup>) {
-    let Some(group) = origin else { return writer.tag(0) };
+fn write_group(writer: &mut Writer, group: StageGroup) {
     writer.tag(match group.family {
         StageFamily::State => 1,
         StageFamily::Input => 2,
@@ -197,15 +292,15 @@ pub(super) fn write_origin(writer: &mut Writer, origin: Option<StageGroup>) {
     writer.count(group.stage);
 }
 
-pub(super) fn read_origin(reader: &mut Reader<'_>) -> Result<Option<StageGroup>, DecodeError> {
-    let family = match reader.tag()? {
-        0 => return Ok(None),
+/// The family's tag was read already.
+fn read_group(reader: &mut Reader<'_>, family: u8) -> Result<StageGroup, DecodeError> {
+    let family = match family {
         1 => StageFamily::State,
         2 => StageFamily::Input,
         3 => StageFamily::Terminal,
         other => return Err(unknown(reader, "origin", other)),
     };
-    Ok(Some(StageGroup { family, stage: reader.count()? }))
+    Ok(StageGroup { family, stage: reader.count()? })
 }
 
 fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {

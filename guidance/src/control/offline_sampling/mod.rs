@@ -40,21 +40,40 @@
 mod artifact;
 mod design;
 mod encoding;
+mod nominal;
 mod problem;
+mod sampled;
 mod state;
 mod step;
+mod terminal;
+mod tube;
 
-pub use artifact::{Artifact, Summary};
-pub use design::Shard;
-pub use problem::{CostWeights, GainChoice, Problem, Redundancy, SampleChoice};
+pub use artifact::{Artifact, GroupSummary, RowOrigin, Summary, TubeSummary};
+pub use problem::{
+    Coordinates, CostWeights, GainChoice, Problem, Redundancy, SampleChoice, Scheme,
+};
+pub use sampled::Shard;
 pub use state::State;
 pub use step::{Branch, Command, Diagnostics, Measurement, Step, Verdict};
 
-use super::{Controller, PrepareError, StepError};
+use super::{Controller, Failure, PrepareError, StepError};
 use crate::budget::Budget;
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
 pub const VERSION: &str = "1";
+
+/// Everything that can be said against a problem before anything is sampled: faults, a gain that
+/// does not stabilise, a terminal set or tube that does not exist.
+///
+/// # Errors
+/// As [`Controller::run_shard`].
+pub fn check(problem: &Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+    match problem.scheme {
+        Scheme::OfflineSampling => sampled::check(problem, budget),
+        Scheme::LinearQuadratic => nominal::prepare(problem, budget).map(drop),
+        Scheme::TubeRobust => tube::prepare(problem, budget).map(drop),
+    }
+}
 
 /// The method, as a [`Controller`].
 #[derive(Debug, Clone, Copy)]
@@ -68,9 +87,12 @@ impl Controller for OfflineSampling {
     type Measurement = Measurement;
     type Answer = Step;
 
-    /// One a sampled group, and one for the expected cost.
+    /// One a part of a sampled group, and one for the expected cost; one for a baseline.
     fn shards(problem: &Problem) -> usize {
-        problem.groups().len() + 1
+        match problem.scheme {
+            Scheme::OfflineSampling => sampled::shards(problem),
+            Scheme::LinearQuadratic | Scheme::TubeRobust => 1,
+        }
     }
 
     fn run_shard(
@@ -78,11 +100,28 @@ impl Controller for OfflineSampling {
         shard: usize,
         budget: Budget<'_>,
     ) -> Result<Shard, PrepareError> {
-        design::run_shard(problem, shard, budget)
+        let whole = |artifact| Shard::Whole(Box::new(artifact));
+        match problem.scheme {
+            Scheme::OfflineSampling => sampled::run_shard(problem, shard, budget),
+            Scheme::LinearQuadratic => nominal::prepare(problem, budget).map(whole),
+            Scheme::TubeRobust => tube::prepare(problem, budget).map(whole),
+        }
     }
 
-    fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
-        design::merge(problem, &shards)
+    fn merge(
+        problem: &Problem,
+        shards: Vec<Shard>,
+        budget: Budget<'_>,
+    ) -> Result<Artifact, PrepareError> {
+        let whole = shards.iter().find_map(|shard| match shard {
+            Shard::Whole(artifact) => Some(artifact.as_ref().clone()),
+            _ => None,
+        });
+        match (problem.scheme, whole) {
+            (Scheme::OfflineSampling, _) => sampled::merge(problem, &shards, budget),
+            (_, Some(artifact)) => Ok(artifact),
+            (_, None) => Err(Failure::Numerical("shards are missing".into()).into()),
+        }
     }
 
     fn start(_artifact: &Artifact) -> State {

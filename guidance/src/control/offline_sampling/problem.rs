@@ -4,17 +4,21 @@ use nalgebra::DMatrix;
 
 use crate::{
     control::Fault,
-    dynamics::{PlantMatrices, UncertainPlant},
+    dynamics::{Discretisation, PlantMatrices, UncertainPlant},
     reach::{GrowthLimits, InvariantLimits, StageFamily, StageGroup},
-    sampling::{ScalarLaw, sample_size},
+    sampling::{ScalarLaw, VIOLATION_MAX, sample_size},
     sets::Polytope,
 };
 
 /// A mission; the target is the origin of the state's coordinates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
+    /// Which controller.
+    pub scheme: Scheme,
     /// What is controlled.
     pub plant: UncertainPlant,
+    /// What the components of its state and input are.
+    pub coordinates: Coordinates,
     /// Plants whose hull holds every plant; `None`: the corners of the parameters' box.
     pub vertices: Option<Vec<PlantMatrices>>,
     /// Law of each component of w.
@@ -25,20 +29,47 @@ pub struct Problem {
     pub gain: GainChoice,
     /// Q and R; P follows.
     pub weights: CostWeights,
-    /// H_x x <= h_x, each row with its probability.
+    /// H_x x <= h_x, each row with its probability; the baselines know no probability.
     pub state_set: Polytope,
     /// H_u u <= h_u, always.
     pub input_set: Polytope,
-    /// How many samples.
+    /// How many samples; read with [`Scheme::OfflineSampling`] only.
     pub samples: SampleChoice,
-    /// What becomes of rows that do not matter.
+    /// What becomes of rows that do not matter; read with [`Scheme::OfflineSampling`] only.
     pub redundancy: Redundancy,
-    /// How far the terminal set is searched.
+    /// How far the terminal set, and the tube of [`Scheme::TubeRobust`], are searched.
     pub terminal_limits: InvariantLimits,
-    /// How far the first-step set grows.
-    pub growth: GrowthLimits,
+    /// How far the first-step set grows; `None`: no such set, and no promise that every step has
+    /// an answer. Read with [`Scheme::OfflineSampling`] only.
+    pub first_step: Option<GrowthLimits>,
     /// All chance follows from this.
     pub seed: u64,
+}
+
+/// What the components of state and input are. The mathematics is the same; whoever measures and
+/// thrusts has to know.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Coordinates {
+    /// Anything.
+    General,
+    /// State [x, y, x', y'] in m and m/s in a plane at rest, input force in N.
+    Planar,
+    /// State position and velocity in RTN in m and m/s, input force in N.
+    Rtn,
+}
+
+/// Which controller: the method, or one of the two that [Mammarella2019, table III] compares it
+/// with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scheme {
+    /// Chance constraints, sampled offline.
+    OfflineSampling,
+    /// The plant at expected parameters and without disturbance, all constraints as they are: not
+    /// robust, as a contrast.
+    LinearQuadratic,
+    /// A nominal trajectory with tightened constraints inside an invariant tube that holds every
+    /// plant and disturbance: robust, whatever the law of either.
+    TubeRobust,
 }
 
 /// How K of u = K x + v is found.
@@ -79,6 +110,8 @@ pub struct SampleChoice {
     pub size: Option<usize>,
     /// Rows of the state at stage 0 too.
     pub state_at_start: bool,
+    /// Most rows of all groups together, before any is removed.
+    pub rows_max: usize,
 }
 
 /// What becomes of rows that do not matter.
@@ -101,22 +134,52 @@ impl Problem {
         (self.plant.states(), self.plant.inputs())
     }
 
-    /// The sampled groups, in their order.
+    /// Components of d: T m corrections, and n more of the place in the tube.
+    pub(super) fn decisions(&self) -> usize {
+        let (n, m) = self.dimensions();
+        let place = if self.scheme == Scheme::TubeRobust { n } else { 0 };
+        self.horizon.saturating_mul(m).saturating_add(place)
+    }
+
+    /// Seconds between steps, where the plant says so.
+    #[must_use]
+    pub fn sample_time_s(&self) -> Option<f64> {
+        match self.plant.discretisation {
+            Discretisation::None => None,
+            Discretisation::ZeroOrderHold { sample_time_s }
+            | Discretisation::Euler { sample_time_s } => Some(sample_time_s),
+        }
+    }
+
+    /// The groups of constraints, in their order.
     #[must_use]
     pub fn groups(&self) -> Vec<StageGroup> {
-        StageGroup::all(self.horizon, self.samples.state_at_start)
+        // A tube bounds what acts on the state by the state set, so the state must start there.
+        let at_start = self.scheme == Scheme::TubeRobust || self.samples.state_at_start;
+        StageGroup::all(self.horizon, at_start)
+    }
+
+    /// d of the sample size of a group: x and the corrections that meet chance before its stage.
+    fn variables(&self, group: &StageGroup) -> usize {
+        let (n, m) = self.dimensions();
+        n + group.stage * m
     }
 
     /// Samples of each group; the sizes were checked by [`Problem::faults`].
     pub(super) fn sizes(&self) -> Vec<usize> {
-        let (n, m) = self.dimensions();
         let size = |group: &StageGroup| {
-            let variables = self.samples.variables.unwrap_or(n + group.stage * m);
+            let variables = self.samples.variables.unwrap_or(self.variables(group));
             let bound =
                 sample_size(variables, self.samples.violation, self.samples.confidence_complement);
             self.samples.size.or(bound.ok()).unwrap_or(0)
         };
         self.groups().iter().map(size).collect()
+    }
+
+    /// Does every group have the samples that the bound asks for?
+    pub(super) fn sampled_by_the_bound(&self) -> bool {
+        let most = self.groups().iter().map(|group| self.variables(group)).max().unwrap_or(0);
+        self.samples.size.is_none() && self.samples.variables.is_none_or(|given| given >= most)
     }
 
     /// Chance constraints that the sampled sets speak of: one a row and stage, states and terminal.
@@ -171,28 +234,37 @@ impl Problem {
         let positive = |value: usize| if value > 0 { "at least 1".into() } else { "0".to_owned() };
         expect("horizon", "at least 1".into(), positive(self.horizon));
         expect("weights.samples", "at least 1".into(), positive(self.weights.samples));
-        faults.extend(self.chance_faults());
+        if let Some(i) = self.disturbance.iter().position(|law| law.check().is_err()) {
+            faults.push(Fault::new(format!("disturbance[{i}]"), "a sound law", "none"));
+        }
+        if self.scheme == Scheme::OfflineSampling {
+            faults.extend(self.chance_faults());
+        }
         faults
     }
 
     fn chance_faults(&self) -> Vec<Fault> {
         let mut faults = Vec::new();
-        if let Some(i) = self.disturbance.iter().position(|law| law.check().is_err()) {
-            faults.push(Fault::new(format!("disturbance[{i}]"), "a sound law", "none"));
+        let SampleChoice { violation, confidence_complement, variables, size, .. } = self.samples;
+        // The two are checked apart, so that both are named where both are wrong.
+        if let Err(error) = sample_size(1, violation, 0.5) {
+            let got = violation.to_string();
+            faults.push(Fault::new("samples.violation", error.to_string(), got));
         }
-        let SampleChoice { violation, confidence_complement, size, .. } = self.samples;
-        if let Err(error) = sample_size(1, violation, confidence_complement) {
-            let got = format!("{violation}, {confidence_complement}");
-            faults.push(Fault::new("samples", error.to_string(), got));
+        if let Err(error) = sample_size(1, 0.5 * VIOLATION_MAX, confidence_complement) {
+            let got = confidence_complement.to_string();
+            faults.push(Fault::new("samples.confidence_complement", error.to_string(), got));
         }
-        if size == Some(0) {
-            faults.push(Fault::new("samples.size", "at least 1", "0"));
+        for (field, count) in [("samples.size", size), ("samples.variables", variables)] {
+            if count == Some(0) {
+                faults.push(Fault::new(field, "at least 1", "0"));
+            }
         }
         if let Redundancy::InnerScaled { epsilon } = self.redundancy
             && !(epsilon > 0.0 && epsilon < 1.0)
         {
             let got = epsilon.to_string();
-            faults.push(Fault::new("redundancy.epsilon", "between 0 and 1", got));
+            faults.push(Fault::new("redundancy.inner_scaled.epsilon", "between 0 and 1", got));
         }
         faults
     }

@@ -2,7 +2,7 @@
 
 use nalgebra::DVector;
 
-use super::{Artifact, State};
+use super::{Artifact, RowOrigin, Scheme, State};
 use crate::{
     budget::Budget,
     control::{
@@ -15,16 +15,24 @@ use crate::{
         QuadraticSolution, Status, prove_infeasible, verify_quadratic,
     },
     reach::{StageFamily, StageGroup},
+    units::Seconds,
 };
 
 /// Largest violation of a row of unit length that a certificate passes, relative to 1 + |b|.
 const TOLERANCE: f64 = 1e-8;
 
-/// What was measured: x, n values, the target at the origin.
+/// A measurement must be this near to a step's time, as a share of the sample time.
+const EPOCH_TOLERANCE: f64 = 1e-3;
+
+/// What was measured.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Measurement {
-    /// x.
+    /// x, n values, the target at the origin.
     pub state: DVector<f64>,
+    /// Time since the mission's start: that of the step that the controller state is for, or a
+    /// whole number of steps later, then those in between were missed. Needs a plant with a
+    /// sample time.
+    pub elapsed: Option<Seconds>,
 }
 
 /// One decided step.
@@ -60,6 +68,12 @@ pub struct Command {
     pub corrections: Vec<f64>,
     /// The input was moved into the input set: only where the previous plan's tail is flown.
     pub clipped: bool,
+    /// z_0, the nominal state whose tube the state is in; with [`Scheme::TubeRobust`] only.
+    pub nominal: Option<DVector<f64>>,
+    /// x_0 .. x_T of the expected plant under u_l = K x_l + v_l.
+    pub expected_states: Vec<DVector<f64>>,
+    /// u_0 .. u_{T-1} of the same.
+    pub expected_inputs: Vec<DVector<f64>>,
 }
 
 /// How a step came about.
@@ -75,6 +89,8 @@ pub struct Diagnostics {
     pub scans: usize,
     /// The general solver had to decide.
     pub general_solver: bool,
+    /// Steps for which no measurement came since the last answer.
+    pub missed_steps: usize,
     /// Why there was no optimum, where there was none: rows that exclude each other.
     pub conflict: Option<Infeasibility>,
 }
@@ -96,51 +112,196 @@ pub(super) fn step(
     measurement: &Measurement,
     budget: Budget<'_>,
 ) -> Result<Step, StepError> {
-    let (n, _) = artifact.problem().dimensions();
-    let x = &measurement.state;
-    if x.len() != n || !x.iter().all(|x| x.is_finite()) {
-        let got = format!("{x:?}");
-        return Err(StepError::Measurement(vec![Fault::new(
-            "state",
-            format!("{n} finite values"),
-            got,
-        )]));
-    }
-    let rows = artifact.correction_rows();
-    if !state.fits(rows.columns(), rows.len()) {
-        return Err(StepError::State("it does not fit this artifact".into()));
-    }
-    let (gradient, offsets) = artifact.online(x.as_slice());
+    let present = Present::new(artifact, state, measurement)?;
+    let (gradient, offsets) = artifact.online(present.x.as_slice());
     let program = QuadraticProgram {
         cost: artifact.quadratic(),
         gradient: &gradient,
-        rows,
+        rows: artifact.decision_rows(),
         offsets: &offsets,
     };
     let (solution, general) = solve(&program, &state.active, budget)?;
+    let diagnostics = Diagnostics {
+        branch: Branch::None,
+        expected_cost: None,
+        iterations: solution.iterations,
+        scans: solution.scans,
+        general_solver: general,
+        missed_steps: present.missed,
+        conflict: None,
+    };
     if solution.status == Status::PrimalInfeasible {
-        let conflict = conflict(artifact, &program, &solution.active);
-        return fall_back(artifact, state, x, &program, (&solution, general), conflict);
+        return present.fall_back(&program, &solution, diagnostics);
     }
-    let certificate = certify(artifact, &program, &solution, x, Claim::Global);
+    let certificate = certify(artifact, &program, &solution, present.x, Claim::Global);
     if !certificate.passed {
         return Err(Failure::Numerical("the optimum did not pass its certificate".into()).into());
     }
-    let input = input(artifact, x, &solution.point);
+    let command = present.command(&solution.point, false);
     Ok(Step {
-        index: state.step,
-        next: next(artifact, state, &solution.point, solution.active_rows()),
+        index: present.step,
+        next: present.next(&command, solution.active_rows()),
         diagnostics: Diagnostics {
             branch: Branch::Optimum,
             expected_cost: Some(certificate.cost),
-            iterations: solution.iterations,
-            scans: solution.scans,
-            general_solver: general,
-            conflict: None,
+            ..diagnostics
         },
         certificate: Some(certificate),
-        verdict: Verdict::Command(Command { input, corrections: solution.point, clipped: false }),
+        verdict: Verdict::Command(command),
     })
+}
+
+/// The step to be decided.
+struct Present<'a> {
+    artifact: &'a Artifact,
+    step: usize,
+    missed: usize,
+    x: &'a DVector<f64>,
+    /// Decisions of the previous plan for this step; `None` at the start.
+    tail: Option<Vec<f64>>,
+}
+
+impl<'a> Present<'a> {
+    /// Checks state and measurement against the artifact, and catches up on missed steps.
+    fn new(
+        artifact: &'a Artifact,
+        state: &State,
+        measurement: &'a Measurement,
+    ) -> Result<Self, StepError> {
+        let problem = artifact.problem();
+        let (n, m) = problem.dimensions();
+        let nominal = if problem.scheme == Scheme::TubeRobust { n } else { 0 };
+        if !state.fits(problem.horizon * m, nominal, artifact.rows().len()) {
+            return Err(StepError::State("it does not fit this artifact".into()));
+        }
+        let x = &measurement.state;
+        let mut faults = Vec::new();
+        if x.len() != n || !x.iter().all(|x| x.is_finite()) {
+            faults.push(Fault::new("state", format!("{n} finite values"), format!("{x:?}")));
+        }
+        let missed = missed_steps(problem.sample_time_s(), state.step, measurement.elapsed);
+        let missed = missed.map_err(|fault| faults.push(fault));
+        let (true, Ok(missed)) = (faults.is_empty(), missed) else {
+            return Err(StepError::Measurement(faults));
+        };
+        let commands_left = problem.horizon - 1;
+        if missed > commands_left && state.step > 0 {
+            return Err(StepError::PlanExhausted { missed, commands_left });
+        }
+        let tail = (state.step > 0).then(|| tail(artifact, state, missed, x));
+        Ok(Self { artifact, step: state.step.saturating_add(missed), missed, x, tail })
+    }
+
+    /// The command of decisions d.
+    fn command(&self, decisions: &[f64], clipped: bool) -> Command {
+        let (n, m) = self.artifact.problem().dimensions();
+        let (corrections, place) = decisions.split_at(self.artifact.problem().horizon * m);
+        let (mut states, mut inputs) = (vec![self.x.clone()], Vec::new());
+        for v in corrections.chunks_exact(m) {
+            let input = input(self.artifact, &states[inputs.len()], v);
+            states.push(self.artifact.expected_step(&states[inputs.len()], &input));
+            inputs.push(input);
+        }
+        Command {
+            input: inputs[0].clone(),
+            corrections: corrections.to_vec(),
+            clipped,
+            nominal: (place.len() == n).then(|| self.x - DVector::from_column_slice(place)),
+            expected_states: states,
+            expected_inputs: inputs,
+        }
+    }
+
+    /// What the next step starts from: the plan one step on, with v = 0 at its end.
+    fn next(&self, command: &Command, mut active: Vec<usize>) -> State {
+        let (_, m) = self.artifact.problem().dimensions();
+        let (first, rest) = command.corrections.split_at(m);
+        let mut tail = rest.to_vec();
+        tail.resize(command.corrections.len(), 0.0);
+        let nominal = command.nominal.as_ref().map_or_else(Vec::new, |z| {
+            let input = input(self.artifact, z, first);
+            self.artifact.expected_step(z, &input).as_slice().to_vec()
+        });
+        active.truncate(tail.len() + nominal.len());
+        State { step: self.step + 1, tail, nominal, active }
+    }
+
+    /// Flies the previous plan's tail, clipped into the input set, and says so.
+    fn fall_back(
+        &self,
+        program: &QuadraticProgram<'_>,
+        solution: &QuadraticSolution,
+        diagnostics: Diagnostics,
+    ) -> Result<Step, StepError> {
+        let artifact = self.artifact;
+        let conflict = conflict(artifact, program, &solution.active);
+        let mut diagnostics = Diagnostics { conflict: Some(conflict.clone()), ..diagnostics };
+        let Some(tail) = &self.tail else {
+            return Ok(Step {
+                index: self.step,
+                verdict: Verdict::Infeasible(conflict),
+                next: State::START,
+                certificate: None,
+                diagnostics,
+            });
+        };
+        let wanted = input(artifact, self.x, tail);
+        let input = nearest_input(artifact, &wanted)?;
+        let clipped = (&input - &wanted).amax() > 0.0;
+        let mut decisions = tail.clone();
+        for (v, (u, w)) in decisions.iter_mut().zip(input.iter().zip(wanted.iter())) {
+            *v += u - w;
+        }
+        let flown =
+            QuadraticSolution { point: decisions.clone(), active: Vec::new(), ..solution.clone() };
+        let certificate = certify(artifact, program, &flown, self.x, Claim::PreviousPlanTail);
+        diagnostics.branch = Branch::PreviousPlanTail;
+        diagnostics.expected_cost = Some(certificate.cost);
+        let command = Command { input, ..self.command(&decisions, clipped) };
+        Ok(Step {
+            index: self.step,
+            next: self.next(&command, Vec::new()),
+            verdict: Verdict::Command(command),
+            certificate: Some(certificate),
+            diagnostics,
+        })
+    }
+}
+
+/// How many steps after the one that was expected.
+fn missed_steps(
+    sample_time_s: Option<f64>,
+    step: usize,
+    elapsed: Option<Seconds>,
+) -> Result<usize, Fault> {
+    let Some(elapsed) = elapsed else { return Ok(0) };
+    let got = format!("{}", elapsed.seconds());
+    let Some(sample_time) = sample_time_s else {
+        return Err(Fault::new("elapsed_s", "none, because the plant has no sample time", got));
+    };
+    let late = elapsed.seconds() / sample_time - step as f64;
+    let whole = libm::round(late);
+    if whole >= 0.0 && whole < 1e9 && (late - whole).abs() <= EPOCH_TOLERANCE {
+        return Ok(whole as usize);
+    }
+    let expected = format!("{} or a whole number of steps later", step as f64 * sample_time);
+    Err(Fault::new("elapsed_s", expected, got))
+}
+
+/// Decisions of the last plan, `missed` steps on, for the present state.
+fn tail(artifact: &Artifact, state: &State, missed: usize, x: &DVector<f64>) -> Vec<f64> {
+    let (_, m) = artifact.problem().dimensions();
+    let mut nominal = DVector::from_column_slice(&state.nominal);
+    if !nominal.is_empty() {
+        for v in state.tail.chunks_exact(m).take(missed) {
+            let input = input(artifact, &nominal, v);
+            nominal = artifact.expected_step(&nominal, &input);
+        }
+    }
+    let mut decisions = state.tail[missed * m..].to_vec();
+    decisions.resize(state.tail.len(), 0.0);
+    decisions.extend(x.iter().zip(nominal.iter()).map(|(x, z)| x - z));
+    decisions
 }
 
 /// The fast solver, and the general one where it does not trust itself.
@@ -167,67 +328,10 @@ fn solve(
     }
 }
 
-/// u = K x + v_0.
+/// u = K x + v.
 fn input(artifact: &Artifact, x: &DVector<f64>, corrections: &[f64]) -> DVector<f64> {
     let fed_back = times_vector(&artifact.summary().gain, x);
     DVector::from_iterator(fed_back.len(), fed_back.iter().zip(corrections).map(|(k, v)| k + v))
-}
-
-/// The corrections one step on, with 0 at the end.
-fn next(artifact: &Artifact, state: &State, corrections: &[f64], active: Vec<usize>) -> State {
-    let (_, m) = artifact.problem().dimensions();
-    let mut tail = corrections[m..].to_vec();
-    tail.resize(corrections.len(), 0.0);
-    let mut active = active;
-    active.truncate(corrections.len());
-    State { step: state.step + 1, tail, active }
-}
-
-/// Flies the previous plan's tail, clipped into the input set, and says so.
-fn fall_back(
-    artifact: &Artifact,
-    state: &State,
-    x: &DVector<f64>,
-    program: &QuadraticProgram<'_>,
-    (solution, general_solver): (&QuadraticSolution, bool),
-    conflict: Infeasibility,
-) -> Result<Step, StepError> {
-    let mut diagnostics = Diagnostics {
-        branch: Branch::None,
-        expected_cost: None,
-        iterations: solution.iterations,
-        scans: solution.scans,
-        general_solver,
-        conflict: Some(conflict.clone()),
-    };
-    if state.tail.is_empty() {
-        return Ok(Step {
-            index: state.step,
-            verdict: Verdict::Infeasible(conflict),
-            next: state.clone(),
-            certificate: None,
-            diagnostics,
-        });
-    }
-    let wanted = input(artifact, x, &state.tail);
-    let input = nearest_input(artifact, &wanted)?;
-    let clipped = (&input - &wanted).amax() > 0.0;
-    let mut corrections = state.tail.clone();
-    for (v, (u, w)) in corrections.iter_mut().zip(input.iter().zip(wanted.iter())) {
-        *v += u - w;
-    }
-    let flown =
-        QuadraticSolution { point: corrections.clone(), active: Vec::new(), ..solution.clone() };
-    let certificate = certify(artifact, program, &flown, x, Claim::PreviousPlanTail);
-    diagnostics.branch = Branch::PreviousPlanTail;
-    diagnostics.expected_cost = Some(certificate.cost);
-    Ok(Step {
-        index: state.step,
-        next: next(artifact, state, &corrections, Vec::new()),
-        verdict: Verdict::Command(Command { input, corrections, clipped }),
-        certificate: Some(certificate),
-        diagnostics,
-    })
 }
 
 /// The nearest input of the input set; the same one if it is inside.
@@ -321,13 +425,17 @@ fn conflict(
 }
 
 /// The family and stage of a row; the first-step rows bound the state of stage 1.
-fn family(origin: Option<StageGroup>) -> (ConstraintFamily, usize) {
+fn family(origin: RowOrigin) -> (ConstraintFamily, usize) {
     match origin {
-        None => (ConstraintFamily::Dynamics, 1),
-        Some(StageGroup { family: StageFamily::State, stage }) => (ConstraintFamily::State, stage),
-        Some(StageGroup { family: StageFamily::Input, stage }) => (ConstraintFamily::Input, stage),
-        Some(StageGroup { family: StageFamily::Terminal, stage }) => {
-            (ConstraintFamily::Terminal, stage)
-        }
+        RowOrigin::FirstStep => (ConstraintFamily::FirstStep, 1),
+        RowOrigin::Tube => (ConstraintFamily::Tube, 0),
+        RowOrigin::Stage(StageGroup { family, stage }) => (
+            match family {
+                StageFamily::State => ConstraintFamily::State,
+                StageFamily::Input => ConstraintFamily::Input,
+                StageFamily::Terminal => ConstraintFamily::Terminal,
+            },
+            stage,
+        ),
     }
 }

@@ -116,7 +116,11 @@ impl Controller for VariableHorizon {
         Artifact::prepare(problem)
     }
 
-    fn merge(problem: &Problem, shards: Vec<Artifact>) -> Result<Artifact, PrepareError> {
+    fn merge(
+        problem: &Problem,
+        shards: Vec<Artifact>,
+        _budget: Budget<'_>,
+    ) -> Result<Artifact, PrepareError> {
         match shards.into_iter().next() {
             Some(artifact) => Ok(artifact),
             None => Artifact::prepare(problem),

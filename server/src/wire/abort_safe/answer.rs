@@ -6,8 +6,8 @@ use vbar_guidance::{
     control::{
         Certificate, Fault,
         abort_safe::{
-            self as method, AbortCommand, AbortOrigin, AbortReason, AbortSafe, Artifact, Command, Diagnostics,
-            PhaseSummary, Problem, Step, Trajectory, Verdict,
+            self as method, AbortCommand, AbortOrigin, AbortReason, AbortSafe, Artifact, Command,
+            Diagnostics, PhaseSummary, Problem, Step, Trajectory, UnsafeState, Verdict,
         },
     },
     dynamics::RelativeVector,
@@ -15,7 +15,9 @@ use vbar_guidance::{
 };
 use vbar_proto::v1;
 
-use super::verdict::{force_now, render_sequence, render_state_verdict, render_working};
+use super::verdict::{
+    force_now, render_sequence, render_state, render_state_verdict, render_working,
+};
 use crate::wire::{
     Planning, SolverWork, VerdictKind, Wired, count,
     orbits::{calendar_after, components},
@@ -71,7 +73,10 @@ impl Wired for AbortSafe {
         method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
-    fn measurement(measured: &ElapsedAndState) -> Result<method::Measurement, Fault> {
+    fn measurement(
+        _: &method::Artifact,
+        measured: &ElapsedAndState,
+    ) -> Result<method::Measurement, Fault> {
         match &measured.state {
             MeasuredState::Relative(state) => Ok(method::Measurement {
                 state: *state,
@@ -121,31 +126,17 @@ fn render_artifact(artifact: &Artifact) -> v1::AbortSafeArtifact {
         dominating_modes: made.dominating_modes.iter().copied().map(render_working).collect(),
         hides_approaches_above_m_s: made.hides_approaches_above_m_s,
         outer_box: made.outer_box,
+        crosses_unseen_m: made.crosses_unseen_m,
+        sets_of_all_modes: made
+            .sets_of_all_modes
+            .map(|sets| i64::try_from(sets).unwrap_or(i64::MAX)),
     };
     v1::AbortSafeArtifact {
         steps_per_period: count(problem.steps_per_period),
         fold_error_s: summary.fold_error.seconds(),
         phases: problem.phases.iter().zip(&summary.phases).map(phase).collect(),
-        warnings: (0..problem.phases.len()).flat_map(|i| warnings(artifact, i)).collect(),
+        warnings: summary.warnings(),
     }
-}
-
-/// What the caller should know before flying in a phase.
-pub(super) fn warnings(artifact: &Artifact, phase: usize) -> Vec<String> {
-    let problem = artifact.problem();
-    let summary = artifact.summary();
-    let Some(made) = summary.phases.get(phase) else { return Vec::new() };
-    let hidden = made.hides_approaches_above_m_s.map(|bound| {
-        format!(
-            "phase {phase}: an approach at up to {} m/s would pass through the region unseen, \
-             because being in it counts only up to speed_max_m_s = {bound}",
-            problem.fastest_approach_m_s
-        )
-    });
-    let boxed = made.outer_box.then(|| {
-        format!("phase {phase}: thrust is left, so the box around the ellipsoid is avoided")
-    });
-    hidden.into_iter().chain(boxed).collect()
 }
 
 /// Everything of a step's answer but what the envelope knows.
@@ -155,9 +146,7 @@ fn render_step(artifact: &Artifact, step: &Step, omit_prediction: bool) -> v1::S
     let softened = matches!(&step.verdict, Verdict::Command(command) if command.softened);
     let verdict = match &step.verdict {
         Verdict::Command(command) => VerdictMessage::Command(render_command(problem, command)),
-        Verdict::Abort(abort) => {
-            VerdictMessage::Abort(Box::new(render_abort(problem, step.index, abort)))
-        }
+        Verdict::Abort(abort) => VerdictMessage::Abort(render_abort(problem, step.index, abort)),
         Verdict::Arrived(arrival) => VerdictMessage::Arrived(v1::Arrival {
             completion_steps: count(arrival.completion_steps),
             distance_m: Some(arrival.distance_m),
@@ -173,7 +162,8 @@ fn render_step(artifact: &Artifact, step: &Step, omit_prediction: bool) -> v1::S
     let mut diagnostics = render_diagnostics(&step.diagnostics);
     diagnostics.phase_index = count(step.phase);
     diagnostics.softened = softened;
-    diagnostics.warnings = warnings(artifact, step.phase);
+    diagnostics.warnings = artifact.summary().warnings();
+    diagnostics.unsafe_state = step.unsafe_state.as_ref().map(render_unsafe_state);
     diagnostics.next_state = step
         .safety
         .as_ref()
@@ -230,9 +220,7 @@ fn render_abort(problem: &Problem, step: usize, command: &AbortCommand) -> v1::A
 
 fn render_prediction(problem: &Problem, trajectory: &Trajectory) -> v1::Prediction {
     let rows = |first: usize| {
-        let part = |x: &RelativeVector| {
-            Vector3::new(x[first], x[first + 1], x[first + 2])
-        };
+        let part = |x: &RelativeVector| Vector3::new(x[first], x[first + 1], x[first + 2]);
         Some(render_vectors(&trajectory.states.iter().map(part).collect::<Vec<_>>()))
     };
     let mass = problem.mass.kilograms();
@@ -245,7 +233,16 @@ fn render_prediction(problem: &Problem, trajectory: &Trajectory) -> v1::Predicti
     }
 }
 
-/// Without phase, warnings and the verdict on the next state.
+fn render_unsafe_state(found: &UnsafeState) -> v1::UnsafeState {
+    v1::UnsafeState {
+        working_thrusters: Some(render_working(found.working)),
+        time_to_violation_s: found.doomed_after_s,
+        gauge: found.gauge,
+        outside: found.outside.as_ref().map(render_state),
+    }
+}
+
+/// Without phase, warnings and the verdicts on this state and the next.
 fn render_diagnostics(diagnostics: &Diagnostics) -> v1::AbortSafeDiagnostics {
     let closest = diagnostics.closest;
     v1::AbortSafeDiagnostics {
@@ -257,6 +254,10 @@ fn render_diagnostics(diagnostics: &Diagnostics) -> v1::AbortSafeDiagnostics {
         closest_after_s: closest.map(|closest| closest.at_s),
         iterations: count(diagnostics.iterations),
         general_solver: diagnostics.by_general_solver,
+        softened_because: diagnostics
+            .infeasibility
+            .as_ref()
+            .map(|why| render_infeasible(why, Units::scaled(None))),
         ..v1::AbortSafeDiagnostics::default()
     }
 }

@@ -3,8 +3,8 @@
 use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, Vector3};
 use vbar_guidance::{
     control::abort_safe::{
-        self as method, FRACTIONS_MAX, Fallback, INSTANTS_MAX, NEAREST_MAX, PREDICTION_MAX, Phase,
-        Problem, SAMPLES_MAX, SET_NUMBERS_MAX, Safety, Separation, SetTiming, Watch, Weights,
+        FRACTIONS_MAX, Fallback, INSTANTS_MAX, NEAREST_MAX, NUMBERS_MAX, PREDICTION_MAX, Phase,
+        Problem, STEPS_MAX, Safety, Separation, SetTiming, Watch, Weights,
     },
     mission::{
         AvoidanceRegion, AvoidanceSet, SPEED_MAX_DEFAULT_M_S, THRUSTERS_MAX, ThrustMode, Thruster,
@@ -68,6 +68,7 @@ impl Parse for Problem {
             (sampling?, search?);
         Some(Self {
             orbit: orbit?,
+            epoch: target?.epoch,
             mass: Mass::from_kilograms(mass?),
             sample_time,
             steps_per_period,
@@ -111,8 +112,8 @@ fn sampling(
     let period_s = orbit.period().seconds();
     let ratio = period_s / step_s;
     let samples = ratio.round();
-    if !(1.0..=SAMPLES_MAX as f64).contains(&samples) {
-        let expected = format!("1 to {SAMPLES_MAX} samples in the period of {period_s} s");
+    if !(1.0..=STEPS_MAX as f64).contains(&samples) {
+        let expected = format!("1 to {STEPS_MAX} samples in the period of {period_s} s");
         return door.refuse(place, expected, format!("{step_s} s, {ratio:.3} samples"));
     }
     let miss = (samples - ratio).abs();
@@ -154,9 +155,10 @@ fn thrusters(
             let place = corner.field("force_max_n");
             let force = required_positive(corners.force_max_n, place, door)?;
             let corners = Thrusters::cube_corners(Force::from_newtons(force))?;
-            let turned = corners.list().iter().map(|corner| {
-                Thruster::new(axes?.to_rtn(*corner.direction()), corner.force_max())
-            });
+            let turned = corners
+                .list()
+                .iter()
+                .map(|corner| Thruster::new(axes?.to_rtn(*corner.direction()), corner.force_max()));
             turned.collect::<Option<_>>().and_then(Thrusters::new)
         }
         Some(Form::List(given)) => {
@@ -280,7 +282,7 @@ fn watch(
     let inflation = message.inflation.unwrap_or(1.0);
     let place = path.field("inflation");
     let inflation = number(inflation, |gamma| gamma >= 1.0, "a number, at least 1", place, door);
-    let horizon = integer(message.horizon_steps, 1..=SAMPLES_MAX, path.field("horizon_steps"), door);
+    let horizon = integer(message.horizon_steps, 1..=STEPS_MAX, path.field("horizon_steps"), door);
     let mut or_one = |value: i32, most, name| {
         integer(if value == 0 { 1 } else { value }, 1..=most, path.field(name), door)
     };
@@ -306,8 +308,8 @@ fn room_for_sets(
         return door.refuse(path.field("fractions"), expected, instants);
     }
     let numbers = instants.saturating_mul(samples.unwrap_or(1)).saturating_mul(ELLIPSOID_TERMS);
-    if numbers > SET_NUMBERS_MAX {
-        let expected = format!("sets of at most {} MB", SET_NUMBERS_MAX * 8 / 1_000_000);
+    if numbers > NUMBERS_MAX {
+        let expected = format!("sets of at most {} MB", NUMBERS_MAX * 8 / 1_000_000);
         let got = format!("{} MB", numbers.saturating_mul(8) / 1_000_000);
         return door.refuse(path.field("horizon_steps"), expected, got);
     }
@@ -451,8 +453,8 @@ fn by_rule(
     };
     let thrusters = thrusters?;
     let (count, nominal) = (thrusters.list().len(), thrusters.nominal());
-    let single = |j| ThrustMode::from_bits(1 << j);
-    let without = |j| ThrustMode::from_bits(nominal.bits() & !(1 << j));
+    let single = |j: usize| ThrustMode::from_bits(1 << j);
+    let without = |j: usize| ThrustMode::from_bits(nominal.bits() & !(1 << j));
     Some(match preset {
         Preset::SingleThrusters => (0..count).map(single).collect(),
         Preset::SingleFailures => (0..count).map(without).collect(),

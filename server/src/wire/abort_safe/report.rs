@@ -18,7 +18,7 @@ use vbar_guidance::{
 };
 use vbar_proto::v1;
 
-use super::{answer::warnings, problem::mode_list, verdict::render_state_verdict};
+use super::{problem::mode_list, verdict::render_state_verdict};
 use crate::wire::{
     Artifact, ArtifactId, Controller, Door, Parse, Path, Problem, Provenance, Render, Violations,
     count,
@@ -196,7 +196,11 @@ impl Question {
         budget: Budget<'_>,
     ) -> Result<ReportAnswer, ReportFault> {
         let Some(prepared) = artifact.as_abort_safe() else {
-            return Err(fault("artifact_id", "an artifact of abort_safe", artifact.method().name()));
+            return Err(fault(
+                "artifact_id",
+                "an artifact of abort_safe",
+                artifact.method().name(),
+            ));
         };
         self.check(prepared)?;
         let step_s = prepared.problem().sample_time.seconds();
@@ -228,7 +232,7 @@ impl Question {
                 phase: self.phase,
                 first: *first,
                 states,
-                modes: (!self.modes.is_empty()).then_some(&self.modes),
+                modes: (!self.modes.is_empty()).then_some(self.modes.as_slice()),
             };
             verdicts.extend(safety_report(prepared, &question, budget)?);
         }
@@ -332,12 +336,13 @@ pub(crate) struct ReportAnswer {
 
 impl ReportAnswer {
     fn fits(&self) -> Result<(), ReportFault> {
-        let aborts = self.verdicts.iter().flat_map(|verdict| &verdict.modes).filter_map(|mode| {
-            match &mode.abort {
+        let aborts =
+            self.verdicts.iter().flat_map(|verdict| &verdict.modes).filter_map(|mode| match &mode
+                .abort
+            {
                 AbortVerdict::Found(abort) => Some(abort),
                 AbortVerdict::NoneProved { .. } | AbortVerdict::Undecided { .. } => None,
-            }
-        });
+            });
         let numbers: usize = aborts
             .map(|abort| abort.throttles.iter().map(|row| row.len() + 3).sum::<usize>())
             .sum();
@@ -352,9 +357,6 @@ impl ReportAnswer {
     fn summary(&self, prepared: &Prepared, states: &[v1::StateVerdict]) -> v1::SafetySummary {
         let sum = |pick: fn(&v1::StateVerdict) -> i32| states.iter().map(pick).sum();
         let without = |state: &v1::StateVerdict| state.modes_none_proved + state.modes_undecided;
-        let mut phases: Vec<usize> = self.verdicts.iter().map(|verdict| verdict.phase).collect();
-        phases.sort_unstable();
-        phases.dedup();
         v1::SafetySummary {
             verdicts: sum(|state| count(state.modes.len())),
             found: sum(|state| state.modes_found),
@@ -364,7 +366,7 @@ impl ReportAnswer {
             first_without_abort: states.iter().position(|state| without(state) > 0).map(count),
             closest_distance_m: self.closest.0,
             closest_elapsed_s: self.closest.1,
-            warnings: phases.into_iter().flat_map(|phase| warnings(prepared, phase)).collect(),
+            warnings: prepared.summary().warnings(),
         }
     }
 }

@@ -68,7 +68,7 @@ impl Wired for DisturbanceFeedback {
         method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
-    fn measurement(measured: &ElapsedAndState) -> Result<method::Measurement, Fault> {
+    fn measurement(_: &Plan, measured: &ElapsedAndState) -> Result<method::Measurement, Fault> {
         match &measured.state {
             MeasuredState::Relative(state) => {
                 Ok(method::Measurement { state: in_lvlh(state), elapsed: measured.elapsed })

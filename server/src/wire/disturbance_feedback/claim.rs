@@ -45,6 +45,8 @@ impl Parse for Claimed {
                 Problem::parse(problem, place.field("disturbance_feedback"), door)
             }
             Some(Method::VariableHorizon(_)) => door.refuse(place, EXPECTED, "variable_horizon"),
+            Some(Method::AbortSafe(_)) => door.refuse(place, EXPECTED, "abort_safe"),
+            Some(Method::OfflineSampling(_)) => door.refuse(place, EXPECTED, "offline_sampling"),
             None => door.refuse(place, EXPECTED, "nothing"),
         });
         let place = path.field("plan");

@@ -62,7 +62,10 @@ impl Wired for VariableHorizon {
         method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
-    fn measurement(measured: &ElapsedAndState) -> Result<method::Measurement, Fault> {
+    fn measurement(
+        _: &method::Artifact,
+        measured: &ElapsedAndState,
+    ) -> Result<method::Measurement, Fault> {
         Ok(measurement(measured))
     }
 

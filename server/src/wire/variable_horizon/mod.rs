@@ -21,8 +21,8 @@ use vbar_proto::v1::{self, variable_horizon_problem::Plant as PlantMessage};
 use super::{
     Door, Parse, Path,
     types::{
-        Axes, Size, integer, list, matrix, not_negative, number, polytope, positive, unknown_enum,
-        vector, vector3,
+        Axes, Size, integer, list, matrix, not_negative, number, polytope, positive,
+        symmetric_matrix, unknown_enum, vector, vector3,
     },
 };
 
@@ -218,14 +218,8 @@ fn gain(
         }
         Form::Lqr(weights) => {
             let path = path.field("lqr");
-            let mut square = |message: &Option<v1::Matrix>, size: usize, name| {
-                let path = path.field(name);
-                let message = door.required(message, path)?;
-                let shape = (Size::Exactly(size), Size::Exactly(size));
-                symmetric(matrix(message, shape, path, door)?, path, door)
-            };
-            let state = square(&weights.state, n, "state");
-            let input = square(&weights.input, m, "input");
+            let state = symmetric_matrix(&weights.state, n, path.field("state"), door);
+            let input = symmetric_matrix(&weights.input, m, path.field("input"), door);
             Some(method::GainChoice::Lqr { state: state?, input: input? })
         }
     }
@@ -252,14 +246,6 @@ fn pole_list(
         }
     }
     good.then(|| values.to_vec())
-}
-
-fn symmetric(matrix: DMatrix<f64>, path: Path<'_>, door: &mut Door) -> Option<DMatrix<f64>> {
-    let asymmetry = (&matrix - matrix.transpose()).amax();
-    if asymmetry > 1e-12 * matrix.amax() {
-        return door.refuse(path, "a symmetric matrix", format!("asymmetry of {asymmetry:e}"));
-    }
-    Some(matrix)
 }
 
 fn hill_plant(

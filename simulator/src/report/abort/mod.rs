@@ -70,7 +70,8 @@ impl AbortReport {
     ///   (between them too), `least_distance_m`;
     /// - `failures`: `runs`, `runs_entering` the region, `runs_entering_feasible` (without a
     ///   softened step before), `runs_without_abort`;
-    /// - `phases`: of each `kind`, `sets` kept, `modes` asked, `modes_kept`, `steps`, `time_s`,
+    /// - `phases`: of each `kind`, `sets` kept, `sets_of_all_modes` there would be without mode dominance,
+    ///   `modes` asked, `modes_kept`, `steps`, `time_s`,
     ///   `delta_v_m_s`, `softened_steps`, `begins_at_step`, `unsafe_at_step`, `safe_until_next`;
     /// - `warnings` of the artifact, `artifact_bytes`, `step_latency_ms`, and figures of others:
     ///   `published`, `reference`.
@@ -237,6 +238,7 @@ fn phase_json(phase: &PhaseFigures) -> Value {
     json!({
         "kind": phase.kind,
         "sets": phase.sets,
+        "sets_of_all_modes": phase.sets_of_all_modes,
         "modes": phase.modes,
         "modes_kept": phase.modes_kept,
         "steps": phase.steps,

@@ -80,6 +80,8 @@ pub struct PhaseFigures {
     pub kind: &'static str,
     /// Unsafe sets that the artifact keeps.
     pub sets: i64,
+    /// Sets there would be if those of every mode were kept; `None` where nobody counted.
+    pub sets_of_all_modes: Option<i64>,
     /// Modes that must be survived.
     pub modes: i32,
     /// Modes whose sets are kept.
@@ -211,6 +213,7 @@ fn phase_figures(campaign: &AbortCampaign, phase: usize) -> PhaseFigures {
     PhaseFigures {
         kind: kind.name(),
         sets: made.sets,
+        sets_of_all_modes: made.sets_of_all_modes,
         modes: made.modes,
         modes_kept: made.dominating_modes.len(),
         steps: steps().count(),
