@@ -1,6 +1,11 @@
 //! What flights did, and where they stood to the unsafe sets, against time.
 
-use std::path::{Path, PathBuf};
+use std::{
+    ops::Range,
+    path::{Path, PathBuf},
+};
+
+use plotters::style::RGBColor;
 
 use super::title;
 use crate::{
@@ -21,6 +26,9 @@ const GAUGE_SHOWN: f64 = 2.0;
 /// Lines drawn into one panel.
 const LINES_MAX: usize = 60;
 
+/// Colours of the truths that judge; a mission with more of them shows the first ones.
+const TRUTHS: [RGBColor; 2] = [BLUE, GREEN];
+
 /// Least gauge of the drift from every state, and the phases whose unsafe sets hold it
 /// [AguilarMarsillach2022, fig. 16]; of the first run.
 pub(super) fn safety(
@@ -34,10 +42,8 @@ pub(super) fn safety(
     let mut legend = vec![("next phase begins, or failure", Mark::Dashed, INK)];
     let drifts = flight.samples.iter().any(|sample| !sample.drifts.is_empty());
     if drifts {
-        let names = ["drift, first truth", "drift, second truth"];
-        for (index, name) in names.into_iter().enumerate().take(campaign.judged_by.len()) {
-            legend.push((name, Mark::Line, if index == 0 { BLUE } else { GREEN }));
-        }
+        let truths = campaign.judged_by.iter().map(|truth| truth.name());
+        legend.extend(truths.zip(TRUTHS).map(|(name, color)| (name, Mark::Line, color)));
         legend.push(("border of the region", Mark::Dashed, VERMILION));
     }
     let sets = flight.samples.iter().map(|sample| sample.unsafe_sets.len()).max().unwrap_or(0);
@@ -75,7 +81,7 @@ fn gauges(
     let mut chart = panel(area, &axes)?;
     turning_points(&mut chart, campaign, flight, GAUGE_SHOWN)?;
     dashed(&mut chart, vec![(0.0, 1.0), (end, 1.0)], VERMILION)?;
-    for (index, color) in [BLUE, GREEN].into_iter().enumerate() {
+    for (index, color) in TRUTHS.into_iter().enumerate() {
         let samples = flight.samples.iter().enumerate();
         let points = samples.filter_map(|(k, sample)| {
             let drift = sample.drifts.get(index)?;
@@ -95,26 +101,39 @@ fn memberships(
     let end = minutes(campaign, flight.samples.len());
     let axes = Axes {
         x: 0.0..end,
-        y: 0.0..phases as f64,
+        y: -0.5..phases as f64 - 0.5,
         x_name: "time [min]",
-        y_name: "phase, from above",
+        y_name: "phase",
         title: String::new(),
     };
     let mut chart = panel(area, &axes)?;
     for phase in 0..phases {
-        let bottom = (phases - 1 - phase) as f64;
-        for (k, sample) in flight.samples.iter().enumerate() {
-            if sample.unsafe_sets.get(phase).copied().unwrap_or(false) {
-                let (from, to) = (minutes(campaign, k), minutes(campaign, k + 1));
-                let (low, high) = (bottom + 0.1, bottom + 0.6);
-                let bar = vec![(from, low), (to, low), (to, high), (from, high)];
-                shape(&mut chart, bar, VERMILION, 0.5)?;
-            }
+        let height = phase as f64;
+        for steps in inside(flight, phase) {
+            let (from, to) = (minutes(campaign, steps.start), minutes(campaign, steps.end));
+            let (low, high) = (height - 0.25, height + 0.25);
+            let bar = vec![(from, low), (to, low), (to, high), (from, high)];
+            shape(&mut chart, bar, VERMILION, 0.5)?;
         }
         let kind = campaign.case.model.phases.get(phase).map_or("", |phase| phase.kind.name());
-        note(&mut chart, (0.5 * end, bottom + 0.65), format!("sets of phase {phase}, {kind}"))?;
+        note(&mut chart, (0.5 * end, height + 0.27), format!("sets of phase {phase}, {kind}"))?;
     }
-    turning_points(&mut chart, campaign, flight, phases as f64)
+    turning_points(&mut chart, campaign, flight, phases as f64 - 0.5)
+}
+
+/// Stretches of steps at which states are in the unsafe sets of a phase.
+fn inside(flight: &AbortFlight, phase: usize) -> Vec<Range<usize>> {
+    let mut stretches: Vec<Range<usize>> = Vec::new();
+    for (k, sample) in flight.samples.iter().enumerate() {
+        if sample.unsafe_sets.get(phase) != Some(&true) {
+            continue;
+        }
+        match stretches.last_mut() {
+            Some(last) if last.end == k => last.end = k + 1,
+            _ => stretches.push(k..k + 1),
+        }
+    }
+    stretches
 }
 
 /// Forces along the three axes [AguilarMarsillach2022, figs. 12, 13 and 17].
