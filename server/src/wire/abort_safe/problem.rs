@@ -453,8 +453,8 @@ fn by_rule(
     };
     let thrusters = thrusters?;
     let (count, nominal) = (thrusters.list().len(), thrusters.nominal());
-    let single = |j| ThrustMode::from_bits(1 << j);
-    let without = |j| ThrustMode::from_bits(nominal.bits() & !(1 << j));
+    let single = |j: usize| ThrustMode::from_bits(1 << j);
+    let without = |j: usize| ThrustMode::from_bits(nominal.bits() & !(1 << j));
     Some(match preset {
         Preset::SingleThrusters => (0..count).map(single).collect(),
         Preset::SingleFailures => (0..count).map(without).collect(),

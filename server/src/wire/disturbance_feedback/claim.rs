@@ -45,6 +45,7 @@ impl Parse for Claimed {
                 Problem::parse(problem, place.field("disturbance_feedback"), door)
             }
             Some(Method::VariableHorizon(_)) => door.refuse(place, EXPECTED, "variable_horizon"),
+            Some(Method::AbortSafe(_)) => door.refuse(place, EXPECTED, "abort_safe"),
             None => door.refuse(place, EXPECTED, "nothing"),
         });
         let place = path.field("plan");
