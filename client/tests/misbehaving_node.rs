@@ -340,6 +340,15 @@ async fn plan_calls_are_repeated_and_answered() {
 }
 
 #[tokio::test]
+async fn safety_report_is_repeated_and_answered() {
+    let node = Scripted::new([unavailable()]);
+    let client = connected(&node).await;
+    let request = SafetyReportRequest { first_step_index: 7, ..SafetyReportRequest::default() };
+    let answer = client.safety_report(request).await.unwrap();
+    assert_eq!((answer.summary.unwrap().verdicts, node.calls()), (7, 2));
+}
+
+#[tokio::test]
 async fn step_unavailable_for_ever_ends_after_the_allowed_attempts() {
     let node = Scripted::new((0..50).map(|_| unavailable()));
     let url = serve(&node).await;
