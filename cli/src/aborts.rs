@@ -2,7 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use vbar_simulator::{AbortMission, AbortReport, AbortRunOptions, ProgressBar, fly_aborts};
+use vbar_simulator::{
+    AbortMission, AbortReport, AbortRunOptions, ProgressBar, draw_aborts, fly_aborts,
+};
 
 use crate::{
     failure::Failure,
@@ -40,16 +42,18 @@ pub(crate) async fn fly(
     }
 }
 
-/// Runs, the report and, of a mission of one run, every step of it.
+/// Pictures, runs, the report and, of a mission of one run, every step of it.
 fn write_files(report: &AbortReport, folder: &Path) -> Result<(), Failure> {
-    let cannot =
-        |fault: std::io::Error| Failure::cannot_write(format!("{}: {fault}", folder.display()));
-    let mut written = report.write_runs(folder).map_err(cannot)?;
+    let cannot = |fault: &dyn std::fmt::Display| {
+        Failure::cannot_write(format!("{}: {fault}", folder.display()))
+    };
+    let mut written = draw_aborts(report, folder).map_err(|fault| cannot(&fault))?;
+    written.extend(report.write_runs(folder).map_err(|fault| cannot(&fault))?);
     if report.runs == 1 {
-        written.extend(report.write_traces(folder).map_err(cannot)?);
+        written.extend(report.write_traces(folder).map_err(|fault| cannot(&fault))?);
     }
     let path = folder.join(format!("{}_report.json", report.mission.name));
-    std::fs::write(&path, format!("{:#}\n", report.json())).map_err(cannot)?;
+    std::fs::write(&path, format!("{:#}\n", report.json())).map_err(|fault| cannot(&fault))?;
     written.push(path);
     eprintln!("{} files in {}:", written.len(), folder.display());
     for path in written {

@@ -8,7 +8,7 @@
 //! flown. Closed loops ([`Mission`]) are flown by [`simulate`], plans ([`PlanMission`]) by
 //! [`fly_plans`], loops that can be aborted ([`AbortMission`]) by [`fly_aborts`], many runs at once;
 //! the [`Report`], [`PlanReport`] or [`AbortReport`] holds every trace, the statistics and the
-//! published figures; [`draw`] and [`draw_plans`] make pictures of it.
+//! published figures; [`draw`], [`draw_plans`] and [`draw_aborts`] make pictures of it.
 
 mod campaign;
 mod clearance;
@@ -36,7 +36,7 @@ pub use mission::{
     AbortCase, AbortMission, AbortSources, Mission, MissionError, MissionFile, PlanChanges,
     PlanMission, Published, PublishedAxes, RUNS_MAX, metric_name, metric_named,
 };
-pub use pictures::{PictureError, draw, plan::draw_plans};
+pub use pictures::{PictureError, abort::draw_aborts, draw, plan::draw_plans};
 pub use report::{
     Report, Statistics, Summary,
     abort::{

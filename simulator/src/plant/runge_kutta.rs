@@ -4,13 +4,13 @@ use std::ops::{Add, Mul};
 
 /// The state `duration` after `state`, which holds at `start`.
 ///
-/// `rate(time, state)` is the state's derivative; `step_max(state)` is the longest step allowed
-/// from there.
+/// `rate(time, state)` is the state's derivative; `step_max(time, state)` is the longest step
+/// allowed from there.
 pub(super) fn integrate<S>(
     state: S,
     start: f64,
     duration: f64,
-    step_max: impl Fn(&S) -> f64,
+    step_max: impl Fn(f64, &S) -> f64,
     rate: impl Fn(f64, &S) -> S,
 ) -> S
 where
@@ -20,9 +20,10 @@ where
     let mut left = duration;
     while left > 0.0 {
         // Equal steps as far as one looks from here, so that none is left over at the end.
-        let steps = (left / step_max(&state)).ceil();
+        let time = start + (duration - left);
+        let steps = (left / step_max(time, &state)).ceil();
         let step = if steps > 1.0 { left / steps } else { left };
-        state = advance(state, start + (duration - left), step, &rate);
+        state = advance(state, time, step, &rate);
         left = if steps > 1.0 { left - step } else { 0.0 };
     }
     state

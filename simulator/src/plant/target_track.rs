@@ -5,7 +5,7 @@ use nalgebra::{Vector3, Vector6};
 use super::{
     hermite::{Moment, quintic},
     runge_kutta,
-    sun_moon::SunAndMoon,
+    sun_moon::{SunAndMoon, tides},
     two_body::{
         Elements, OrbitFrame, STEP_MAX, free_fall_time_s, gravity, inertial_state, position_of,
         stacked, velocity_of,
@@ -26,10 +26,23 @@ pub(crate) struct Forces {
 }
 
 impl Forces {
+    /// The field as it stands at one time.
+    pub(super) fn at(&self, time_s: f64) -> Field {
+        Field { j2: self.j2, bodies: self.sun_moon.as_ref().map(|both| both.positions_m(time_s)) }
+    }
+}
+
+/// Gravity at one time.
+pub(super) struct Field {
+    j2: f64,
+    bodies: Option<[Vector3<f64>; 2]>,
+}
+
+impl Field {
     /// Acceleration at `position` from the Earth's centre, m/s^2, inertial axes.
-    pub(super) fn pull(&self, time_s: f64, position: &Vector3<f64>) -> Vector3<f64> {
+    pub(super) fn pull(&self, position: &Vector3<f64>) -> Vector3<f64> {
         let earth = gravity(position, self.j2);
-        self.sun_moon.as_ref().map_or(earth, |bodies| earth + bodies.pull(time_s, position))
+        self.bodies.as_ref().map_or(earth, |bodies| earth + tides(bodies, position))
     }
 }
 
@@ -43,10 +56,10 @@ impl TargetTrack {
     /// From `elements` at time 0 on, for `duration_s`.
     pub(super) fn new(elements: &Elements, forces: &Forces, duration_s: f64) -> Self {
         let rate = |time: f64, state: &Vector6<f64>| {
-            stacked(&velocity_of(state), &forces.pull(time, &position_of(state)))
+            stacked(&velocity_of(state), &forces.at(time).pull(&position_of(state)))
         };
         let step_max =
-            |state: &Vector6<f64>| STEP_MAX * free_fall_time_s(position_of(state).norm());
+            |_, state: &Vector6<f64>| STEP_MAX * free_fall_time_s(position_of(state).norm());
         let count = (duration_s / SPACING_S).ceil() as usize + 1;
         let mut state = inertial_state(elements);
         let moments = (0..=count).map(|index| {
@@ -73,6 +86,6 @@ impl TargetTrack {
     /// The rotating frame, and the state it belongs to.
     pub(super) fn frame(&self, forces: &Forces, time_s: f64) -> OrbitFrame {
         let state = self.state(time_s);
-        OrbitFrame::new(&state, &forces.pull(time_s, &position_of(&state)))
+        OrbitFrame::new(&state, &forces.at(time_s).pull(&position_of(&state)))
     }
 }

@@ -90,7 +90,7 @@ impl TwoBody {
                 derivative(&chaser, self.j2, &thrust),
             ])
         };
-        let step_max = |pair: &Matrix6x2<f64>| {
+        let step_max = |_, pair: &Matrix6x2<f64>| {
             let radius = |craft: usize| pair.fixed_view::<3, 1>(0, craft).norm();
             STEP_MAX * free_fall_time_s(radius(0).min(radius(1)))
         };
