@@ -420,6 +420,73 @@ fn simulate_flies_plans_and_writes_files() {
     }
 }
 
+/// A file in a folder of its own, which must live as long as the file is needed.
+fn file(name: &str, content: &str) -> (tempfile::TempDir, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    std::fs::write(&path, content).unwrap();
+    let path = path.to_str().unwrap().to_owned();
+    (folder, path)
+}
+
+const STATES: &str = "k,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n\
+                      3,0,300,0,0,0,0\n4,0,300,0.5,0,0,0\n5,0,15,0,0,0,0\n";
+
+#[test]
+fn safety_says_what_could_be_done_at_every_state() {
+    let (_folder, trajectory) = file("states.csv", STATES);
+    let iss = mission("iss.json");
+    let ended = output(&["safety", &trajectory, "--mission", &iss, "--phase", "2"]);
+    assert_eq!(ended.status.code(), Some(0), "{}", text(&ended.stderr));
+    let said = text(&ended.stdout);
+    // 254 failures at three states; the last one is in the box already.
+    for part in ["762 verdicts on 3 states", "first state without an abort", "step 5"] {
+        assert!(said.contains(part), "{part} is missing in\n{said}");
+    }
+    let ended = output(&[
+        "safety",
+        &trajectory,
+        "--mission",
+        &iss,
+        "--phase",
+        "2",
+        "--first-step",
+        "7",
+        "--format",
+        "json",
+    ]);
+    let report: Value = serde_json::from_slice(&ended.stdout).unwrap();
+    assert_eq!(report["states"][0]["stepIndex"], 7);
+    assert_eq!(report["states"][2]["modes"].as_array().unwrap().len(), 254);
+    assert!(report["states"][0]["sequences"].is_array(), "JSON has the aborts themselves");
+}
+
+#[test]
+fn safety_refuses_what_makes_no_sense() {
+    let (iss, envisat) = (mission("iss.json"), mission("envisat.json"));
+    let (_a, csv) = file("states.csv", STATES);
+    let (_b, broken) = file("broken.csv", "x_m,y_m\n1,2\n");
+    let (_c, request) = file("request.json", "{\"states\": {\"states\": []}, \"speed\": 1}");
+    let (_d, empty) = file("empty.json", "{\"states\": []}");
+    for (arguments, code, part) in [
+        (&["safety", &broken, "--mission", &iss] as &[&str], 65, "z_m"),
+        (&["safety", &csv, "--mission", &envisat], 65, "no failures"),
+        (&["safety", &request], 65, "speed"),
+        (&["safety", &csv], 65, "SafetyReportRequest"),
+        (&["safety", &empty, "--mission", &iss], 65, "states"),
+        (&["safety", "no/such/file"], 65, "no/such/file"),
+        (&["safety", &csv, "--phase", "1"], 64, "--mission"),
+        (&["simulate", &iss, "--compare-search"], 64, "--compare-search"),
+        (&["simulate", &iss, "--variant", "moon"], 64, "through"),
+        (&["plan", &iss], 64, "step by step"),
+    ] {
+        let ended = output(arguments);
+        let said = text(&ended.stderr);
+        assert_eq!(ended.status.code(), Some(code), "{arguments:?}: {said}");
+        assert!(said.contains(part), "{arguments:?}: {said}");
+    }
+}
+
 /// The nominal next state of the double integrator: the first row after the present one.
 fn expected(prediction: &vbar_client::v1::Prediction) -> Measurement {
     measured_at(prediction.states_nd.as_ref().unwrap().values[2..4].to_vec())

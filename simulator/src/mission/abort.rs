@@ -135,7 +135,7 @@ pub(crate) enum FailureMoment {
     /// At this step, before its command.
     AtStep(u32),
     /// When the gauge of the position in the first phase's region has fallen to a value drawn
-    /// uniformly from these limits.
+    /// uniformly from these limits, or before the last step of a flight that stays farther out.
     AtGauge([f64; 2]),
 }
 

@@ -248,7 +248,8 @@ impl Leg<'_> {
         match (law.when, gauge) {
             (FailureMoment::AtStep(step), _) => k == step,
             (FailureMoment::AtGauge(_), Some(limit)) => {
-                self.flyable.judge.gauge(0, &self.state).is_some_and(|here| here <= limit)
+                let last = k + 1 == self.flyable.case.steps_max();
+                last || self.flyable.judge.gauge(0, &self.state).is_some_and(|here| here <= limit)
             }
             (FailureMoment::AtGauge(_), None) => false,
         }

@@ -56,7 +56,8 @@ impl AbortReport {
     ///
     /// Of each variant:
     ///
-    /// - `runs`, `arrived`, `infeasible`, `redraws`: runs by how they ended;
+    /// - `runs`, `arrived`, `infeasible`, `redraws`: runs by how they ended, and
+    ///   `infeasible_reasons`, an object with `run`, `step`, `reason` each;
     /// - `delta_v_m_s` (sum of |force| over axes and steps, times the step over the mass), `steps`
     ///   and, with failures, `failure_step`, `failure_gauge`, `least_gauge_after_failure`,
     ///   `least_distance_after_failure_m`: each with `mean`, `std`, `min`, `q25`, `median`, `q75`,
@@ -200,6 +201,7 @@ fn variant_json(campaign: &AbortCampaign) -> Map<String, Value> {
         ("runs", summary.runs.into()),
         ("arrived", summary.arrived.into()),
         ("infeasible", summary.infeasible.into()),
+        ("infeasible_reasons", infeasible_reasons(campaign)),
         ("redraws", summary.redraws.into()),
         ("steps_flown", summary.steps.into()),
         ("softened_steps", summary.softened_steps.into()),
@@ -221,6 +223,16 @@ fn variant_json(campaign: &AbortCampaign) -> Map<String, Value> {
     ];
     map.extend(rest.map(|(name, value)| (name.to_owned(), value)));
     map
+}
+
+fn infeasible_reasons(campaign: &AbortCampaign) -> Value {
+    let reason = |flight: &AbortFlight| match &flight.outcome {
+        AbortOutcome::Infeasible(reason) => Some(json!({
+            "run": flight.run, "step": flight.steps.len(), "reason": reason,
+        })),
+        _ => None,
+    };
+    campaign.flights.iter().filter_map(reason).collect()
 }
 
 fn drift_json(drift: &DriftFigures) -> (String, Value) {

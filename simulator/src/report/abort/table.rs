@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, fmt::Write as _};
 
 use super::{AbortReport, AbortSummary, GAUGE_TOLERANCE, PathComparison, PhaseFigures};
 use crate::{
-    campaign::abort::AbortCampaign,
+    campaign::abort::{AbortCampaign, AbortOutcome},
     report::table::{align, number},
 };
 
@@ -34,6 +34,12 @@ fn variant(campaign: &AbortCampaign) -> String {
     let mut text = format!("{}\n{}", campaign.case.name, figures(campaign, &summary));
     if summary.phases.len() > 1 || summary.phases.iter().any(|phase| phase.sets > 0) {
         let _ = write!(text, "{}", phases(&summary));
+    }
+    for flight in &campaign.flights {
+        if let AbortOutcome::Infeasible(reason) = &flight.outcome {
+            let (run, step) = (flight.run, flight.steps.len());
+            let _ = writeln!(text, "  run {run} ended at step {step}: {reason}");
+        }
     }
     let modes = summary.modes;
     let _ = writeln!(
