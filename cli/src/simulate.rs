@@ -71,6 +71,18 @@ pub(crate) struct SimulateArguments {
     changes: ChangeArguments,
 }
 
+impl SimulateArguments {
+    /// Options of closed loops with a variable horizon alone, and whether they were given.
+    fn horizon_options(&self) -> [(&'static str, bool); 4] {
+        [
+            ("--search", self.search.is_some()),
+            ("--misalignment-deg", self.misalignment_deg.is_some()),
+            ("--compare-search", self.compare_search),
+            ("--fuel-weights", !self.fuel_weights.is_empty()),
+        ]
+    }
+}
+
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Search {
     /// From a guess to the nearest feasible horizon, then downhill
@@ -116,7 +128,7 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
 
 /// Flies the plans of a mission with disturbance feedback.
 async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Result<(), Failure> {
-    arguments.mission.refuse(arguments.of_one_method())?;
+    arguments.mission.refuse(arguments.horizon_options())?;
     let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
     let options = FlightOptions {
         run: PlanRunOptions {
@@ -139,7 +151,7 @@ async fn fly_sampling(
     arguments: SimulateArguments,
 ) -> Result<(), Failure> {
     let scheme = arguments.mission.scheme()?;
-    let foreign = arguments.of_one_method().into_iter().find(|(_, given)| *given);
+    let foreign = arguments.horizon_options().into_iter().find(|(_, given)| *given);
     if let Some(name) = foreign.map(|(name, _)| name).or(arguments.changes.given()) {
         return Err(Failure::usage(format!("{name} is not for this mission")));
     }
@@ -156,18 +168,6 @@ async fn fly_sampling(
         out: (!arguments.no_pictures).then_some(folder),
     };
     sampling::fly(mission, &arguments.mission.node, options).await
-}
-
-impl SimulateArguments {
-    /// Options that only variable-horizon missions have, and whether they were given.
-    fn of_one_method(&self) -> [(&'static str, bool); 4] {
-        [
-            ("--search", self.search.is_some()),
-            ("--misalignment-deg", self.misalignment_deg.is_some()),
-            ("--compare-search", self.compare_search),
-            ("--fuel-weights", !self.fuel_weights.is_empty()),
-        ]
-    }
 }
 
 fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
