@@ -5,8 +5,12 @@ use std::{env, fs, path::PathBuf};
 use prost::Message as _;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    const FILES: [&str; 3] =
-        ["vbar/v1/service.proto", "google/longrunning/operations.proto", "google/rpc/status.proto"];
+    const FILES: [&str; 4] = [
+        "vbar/v1/service.proto",
+        "google/longrunning/operations.proto",
+        "google/rpc/error_details.proto",
+        "google/rpc/status.proto",
+    ];
     for folder in ["vbar", "google"] {
         println!("cargo:rerun-if-changed={folder}");
     }

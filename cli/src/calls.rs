@@ -1,4 +1,4 @@
-//! `vbar plan`, `vbar step`, `vbar precompute`, `vbar health`: one call, one answer as JSON.
+//! `vbar plan`, `vbar step`, `vbar health`: one call, one answer as JSON.
 
 use std::{
     fs::File,
@@ -51,13 +51,6 @@ pub(crate) struct StepArguments {
     node: NodeArguments,
 }
 
-/// Give a running node with --server: what a node of our own makes is gone when the command ends.
-#[derive(Debug, Args)]
-pub(crate) struct PrecomputeArguments {
-    #[command(flatten)]
-    mission: MissionArguments,
-}
-
 /// Made for the health check of a container.
 #[derive(Debug, Args)]
 pub(crate) struct HealthArguments {
@@ -71,6 +64,10 @@ pub(crate) struct HealthArguments {
 
 pub(crate) async fn plan(arguments: PlanArguments) -> Result<(), Failure> {
     let mission = match arguments.mission.load()? {
+        MissionFile::AbortSafe(mission) => {
+            let name = &mission.name;
+            return Err(Failure::usage(format!("the mission {name} is flown step by step")));
+        }
         MissionFile::DisturbanceFeedback(mission) => {
             let foreign = [("--initial", arguments.initial.is_some())];
             arguments.mission.refuse(foreign)?;
@@ -110,23 +107,6 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
     json::print(&json::render(&answer?)?)
 }
 
-pub(crate) async fn precompute(arguments: PrecomputeArguments) -> Result<(), Failure> {
-    let problem = match arguments.mission.load()? {
-        MissionFile::DisturbanceFeedback(mission) => {
-            arguments.mission.refuse([])?;
-            mission.problem
-        }
-        MissionFile::OfflineSampling(mission) => arguments.mission.sampling_problem(&mission)?,
-        MissionFile::VariableHorizon(mission) => {
-            arguments.mission.under_one_scheme(*mission)?.problem
-        }
-    };
-    let session = Session::open(&arguments.mission.node).await?;
-    let answer = session.client.precompute(problem).await;
-    session.close().await;
-    json::print(&json::render(&answer?)?)
-}
-
 pub(crate) async fn health(arguments: HealthArguments) -> Result<(), Failure> {
     let time = Duration::from_secs(arguments.timeout_s.into());
     let options = Options { deadline: time, connect_timeout: time, ..Options::default() };
@@ -139,7 +119,7 @@ pub(crate) async fn health(arguments: HealthArguments) -> Result<(), Failure> {
 }
 
 /// The text of a file, or of standard input for `-`.
-fn read(path: &Path) -> Result<String, Failure> {
+pub(crate) fn read(path: &Path) -> Result<String, Failure> {
     let named = |fault: io::Error| Failure::data(format!("{}: {fault}", path.display()));
     let source: Box<dyn Read> = if path == Path::new("-") {
         Box::new(io::stdin())

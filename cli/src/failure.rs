@@ -15,6 +15,9 @@ const SOFTWARE: u8 = 70;
 /// A file that cannot be written.
 const CANNOT_WRITE: u8 = 73;
 
+/// Ctrl-C, as shells say it: 128 and the number of the signal.
+const INTERRUPTED: u8 = 130;
+
 /// What to say, and the exit code.
 #[derive(Debug)]
 pub(crate) struct Failure {
@@ -41,6 +44,15 @@ impl Failure {
 
     pub(crate) fn cannot_write(message: impl Into<String>) -> Self {
         Self { code: CANNOT_WRITE, message: message.into() }
+    }
+
+    pub(crate) fn interrupted(message: impl Into<String>) -> Self {
+        Self { code: INTERRUPTED, message: message.into() }
+    }
+
+    /// The same, about a file.
+    pub(crate) fn in_file(self, path: &str) -> Self {
+        Self { message: format!("{path}: {}", self.message), ..self }
     }
 
     /// The same, in run number `run` of a campaign.

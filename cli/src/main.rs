@@ -4,12 +4,15 @@
 //! `sysexits.h`: 64 for a wrong command line or configuration, 65 for a file that makes no sense,
 //! 69 for a node that does not answer, 70 for a fault of ours.
 
+mod aborts;
 mod calls;
 mod failure;
 mod json;
 mod log;
 mod mission;
 mod plans;
+mod precompute;
+mod safety;
 mod sampling;
 mod serve;
 mod session;
@@ -49,8 +52,10 @@ enum Command {
     Upload(plans::UploadArguments),
     /// Decide one command: a StepRequest as JSON in, the StepResponse as JSON out
     Step(calls::StepArguments),
-    /// Make a mission's artifact on a node and print its summary as JSON
-    Precompute(calls::PrecomputeArguments),
+    /// Make a mission's artifact on a node, show how far it is, and print its summary as JSON
+    Precompute(precompute::PrecomputeArguments),
+    /// Say of a trajectory what could be done at each of its states if thrusters failed
+    Safety(safety::SafetyArguments),
     /// Ask whether a node will answer; exit code 69 if not
     Health(calls::HealthArguments),
 }
@@ -88,7 +93,8 @@ fn run(command: Command) -> Result<(), Failure> {
             Command::Verify(arguments) => plans::verify(&arguments),
             Command::Upload(arguments) => plans::upload(arguments).await,
             Command::Step(arguments) => calls::step(arguments).await,
-            Command::Precompute(arguments) => calls::precompute(arguments).await,
+            Command::Precompute(arguments) => precompute::precompute(arguments).await,
+            Command::Safety(arguments) => safety::safety(arguments).await,
             Command::Health(arguments) => calls::health(arguments).await,
         }
     })

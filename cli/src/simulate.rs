@@ -8,11 +8,12 @@ use std::{
 use clap::{Args, ValueEnum};
 use vbar_client::v1::HorizonSearch;
 use vbar_simulator::{
-    Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar, Report, RunOptions,
-    SamplingMission, SamplingRunOptions, draw,
+    AbortMission, AbortRunOptions, Mission, MissionFile, PlanMission, PlanRunOptions, ProgressBar,
+    Report, RunOptions, SamplingMission, SamplingRunOptions, draw,
 };
 
 use crate::{
+    aborts,
     failure::Failure,
     json,
     mission::MissionArguments,
@@ -102,6 +103,7 @@ pub(crate) enum Format {
 /// Flies a mission and reports.
 pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure> {
     let mission = match arguments.mission.load()? {
+        MissionFile::AbortSafe(mission) => return fly_aborts(&mission, arguments).await,
         MissionFile::DisturbanceFeedback(mission) => return fly_plans(&mission, arguments).await,
         MissionFile::OfflineSampling(mission) => return fly_sampling(&mission, arguments).await,
         MissionFile::VariableHorizon(mission) => *mission,
@@ -124,6 +126,26 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
         tell_pictures(&mission, &report, &folder)?;
     }
     Ok(())
+}
+
+/// Flies a mission under abort-safe control.
+async fn fly_aborts(mission: &AbortMission, arguments: SimulateArguments) -> Result<(), Failure> {
+    if let Some(name) = arguments.changes.given() {
+        return Err(Failure::usage(format!("{name} is not for this mission")));
+    }
+    arguments.mission.refuse(arguments.horizon_options())?;
+    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
+    let options = aborts::FlightOptions {
+        run: AbortRunOptions {
+            runs: arguments.runs,
+            seed: arguments.seed,
+            concurrency: arguments.concurrency,
+            variant: arguments.variant,
+        },
+        format: arguments.format,
+        out: (!arguments.no_pictures).then_some(folder),
+    };
+    aborts::fly(mission, &arguments.mission.node, options).await
 }
 
 /// Flies the plans of a mission with disturbance feedback.

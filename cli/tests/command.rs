@@ -1,5 +1,8 @@
 //! The command as its users see it: processes, exit codes, standard streams.
 
+#[path = "command/crashes.rs"]
+mod crashes;
+
 use std::{
     io::{BufRead as _, BufReader, Write as _},
     path::PathBuf,
@@ -226,6 +229,29 @@ fn precompute_prints_the_artifact() {
     // 0.2671 is what an independent implementation found for this mission.
     let lambda_bar = answer["artifact"]["variableHorizon"]["lambdaBar"].as_f64().unwrap();
     assert!((lambda_bar - 0.2671).abs() < 5e-5, "{lambda_bar}");
+}
+
+#[test]
+fn precompute_interrupted_is_cancelled_on_the_node() {
+    let folder = tempfile::tempdir().unwrap();
+    let node = Process::start(&[]);
+    // So many burns with so little thrust take a long time.
+    let file = std::fs::read_to_string(mission("prisma.json")).unwrap();
+    let mut slow: Value = serde_json::from_str(&file).unwrap();
+    slow["problem"]["disturbanceFeedback"]["instants"] =
+        json!({ "equalTime": { "count": 64, "durationS": 6000.0 } });
+    slow["problem"]["disturbanceFeedback"]["deltaVMaxMS"] = json!(0.2);
+    let path = folder.path().join("slow.json");
+    std::fs::write(&path, slow.to_string()).unwrap();
+    let mut command = vbar(&["precompute", path.to_str().unwrap(), "--server", &node.url]);
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    // It answers after its own wait; until then there is nothing to cancel.
+    std::thread::sleep(Duration::from_secs(3));
+    let pid = child.id().to_string();
+    assert!(Command::new("kill").args(["-INT", &pid]).status().unwrap().success());
+    let ended = child.wait_with_output().unwrap();
+    assert_eq!(ended.status.code(), Some(130), "{}", text(&ended.stderr));
+    assert!(text(&ended.stderr).contains("was cancelled on the node"), "{}", text(&ended.stderr));
 }
 
 /// What `vbar plan` printed, or its complaint as the test's.

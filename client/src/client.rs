@@ -2,7 +2,6 @@
 
 use std::time::Duration;
 
-use prost::{Message, Name};
 use tokio::time::Instant;
 use tonic::{
     Code, Request, Response, Status,
@@ -12,26 +11,17 @@ use tonic_health::pb::{
     HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient,
 };
 use vbar_proto::{
-    google::longrunning::{
-        GetOperationRequest, Operation, WaitOperationRequest, operation,
-        operations_client::OperationsClient,
-    },
+    google::longrunning::operations_client::OperationsClient,
     v1::{
-        Artifact, ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
-        GetArtifactRequest, GetPlanRequest, GetPlanResponse, GetServerInfoRequest,
-        GetServerInfoResponse, ListPlansRequest, ListPlansResponse, PrecomputeRequest,
-        PrecomputeResponse, Problem, StepRequest, StepResponse, UploadPlanRequest,
-        UploadPlanResponse, guidance_service_client::GuidanceServiceClient,
-        step_stream_request::Controller,
+        ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
+        GetPlanRequest, GetPlanResponse, GetServerInfoRequest, GetServerInfoResponse,
+        ListPlansRequest, ListPlansResponse, SafetyReportRequest, SafetyReportResponse,
+        StepRequest, StepResponse, UploadPlanRequest, UploadPlanResponse,
+        guidance_service_client::GuidanceServiceClient, step_stream_request::Controller,
     },
 };
 
 use crate::{ClosedLoop, Error, retry::Attempts};
-
-/// A node is asked to hold one wait for at most this long; then it is asked again.
-const WAIT_MAX: Duration = Duration::from_secs(10);
-/// Shortest and longest pause between two looks at an operation.
-const LOOK_PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_secs(1));
 
 /// How calls are made.
 #[derive(Debug, Clone)]
@@ -39,7 +29,7 @@ pub struct Options {
     /// Longest time for one call, every attempt and pause included. The node is told and stops
     /// computing when it has passed.
     pub deadline: Duration,
-    /// The same for [`Client::precompute`], which thinks long once.
+    /// The same for [`Client::precompute`], waiting included: it thinks long once.
     pub precompute_deadline: Duration,
     /// Longest time to reach the node once.
     pub connect_timeout: Duration,
@@ -65,7 +55,7 @@ impl Default for Options {
 #[derive(Debug, Clone)]
 pub struct Client {
     pub(crate) guidance: GuidanceServiceClient<Channel>,
-    operations: OperationsClient<Channel>,
+    pub(crate) operations: OperationsClient<Channel>,
     health: HealthClient<Channel>,
     pub(crate) options: Options,
 }
@@ -193,6 +183,22 @@ impl Client {
         .await
     }
 
+    /// What could be done along a trajectory if thrusters failed.
+    ///
+    /// # Errors
+    /// `NOT_FOUND` if the node does not have the artifact or plan; `RESOURCE_EXHAUSTED` for a
+    /// report too large for one answer; [`Error`], as every call.
+    pub async fn safety_report(
+        &self,
+        request: SafetyReportRequest,
+    ) -> Result<SafetyReportResponse, Error> {
+        self.call(self.options.deadline, request, |request| {
+            let mut guidance = self.guidance.clone();
+            async move { guidance.safety_report(request).await }
+        })
+        .await
+    }
+
     /// A closed loop from its first step: the controller is sent once, then measurements only.
     ///
     /// The stream is opened by the first measurement, so a refused controller shows there.
@@ -201,39 +207,6 @@ impl Client {
     /// None today: whatever can fail does so in [`ClosedLoop::step`].
     pub async fn closed_loop(&self, controller: Controller) -> Result<ClosedLoop, Error> {
         Ok(ClosedLoop::new(self.clone(), controller))
-    }
-
-    /// Makes an artifact and waits until it is done, within [`Options::precompute_deadline`].
-    ///
-    /// # Errors
-    /// [`Error`], as every call, and whatever ended the operation.
-    pub async fn precompute(&self, problem: Problem) -> Result<PrecomputeResponse, Error> {
-        let deadline = Instant::now() + self.options.precompute_deadline;
-        // No request id: the problem's own digest already makes a repeated call the same job.
-        let request = PrecomputeRequest { problem: Some(problem), ..PrecomputeRequest::default() };
-        let within = self.options.deadline.min(self.options.precompute_deadline);
-        let operation = self
-            .call(within, request, |request| {
-                let mut guidance = self.guidance.clone();
-                async move { guidance.precompute(request).await }
-            })
-            .await?;
-        finished(self.wait(operation, deadline).await?)
-    }
-
-    /// Summary of an artifact that a precompute made.
-    ///
-    /// # Errors
-    /// `NOT_FOUND` if the node does not have it; [`Error`], as every call.
-    pub async fn artifact(&self, artifact_id: &str) -> Result<Artifact, Error> {
-        let request = GetArtifactRequest { artifact_id: artifact_id.to_owned() };
-        let response = self
-            .call(self.options.deadline, request, |request| {
-                let mut guidance = self.guidance.clone();
-                async move { guidance.get_artifact(request).await }
-            })
-            .await?;
-        response.artifact.ok_or_else(|| Error::broken_contract("no artifact in it"))
     }
 
     /// Build, methods and limits of the node.
@@ -262,51 +235,8 @@ impl Client {
         Ok(response.status() == ServingStatus::Serving)
     }
 
-    /// Follows `operation` until it is done.
-    async fn wait(&self, mut operation: Operation, deadline: Instant) -> Result<Operation, Error> {
-        let mut can_wait = true;
-        let mut pause = LOOK_PAUSE.0;
-        while !operation.done {
-            let left = Attempts::new(1, deadline).time_left()?;
-            if can_wait {
-                match self.wait_once(&operation.name, left).await {
-                    Ok(latest) => operation = latest,
-                    // AIP-151 makes waiting optional for a node; looking is not.
-                    Err(error) if error.code == Code::Unimplemented => can_wait = false,
-                    Err(error) => return Err(error),
-                }
-            } else {
-                tokio::time::sleep(pause.min(left)).await;
-                pause = (pause * 2).min(LOOK_PAUSE.1);
-                operation = self.look(&operation.name, left).await?;
-            }
-        }
-        Ok(operation)
-    }
-
-    async fn wait_once(&self, name: &str, left: Duration) -> Result<Operation, Error> {
-        // A shorter wait than the call's own deadline, so that "not done yet" is an answer.
-        let wait = left.min(WAIT_MAX).min(self.options.deadline).mul_f64(0.8);
-        let timeout = prost_types::Duration::try_from(wait).ok();
-        let request = WaitOperationRequest { name: name.to_owned(), timeout };
-        self.call(left.min(self.options.deadline), request, |request| {
-            let mut operations = self.operations.clone();
-            async move { operations.wait_operation(request).await }
-        })
-        .await
-    }
-
-    async fn look(&self, name: &str, left: Duration) -> Result<Operation, Error> {
-        let request = GetOperationRequest { name: name.to_owned() };
-        self.call(left.min(self.options.deadline), request, |request| {
-            let mut operations = self.operations.clone();
-            async move { operations.get_operation(request).await }
-        })
-        .await
-    }
-
     /// One call: deadline, attempts, pauses.
-    async fn call<Q: Clone, A, F>(
+    pub(crate) async fn call<Q: Clone, A, F>(
         &self,
         within: Duration,
         request: Q,
@@ -344,18 +274,4 @@ fn endpoint(url: &str, options: &Options) -> Result<Endpoint, Error> {
     }
     // A step is one small message and one small answer: waiting to fill a packet only delays.
     Ok(Endpoint::from(uri).tcp_nodelay(true).connect_timeout(options.connect_timeout))
-}
-
-/// Result of a finished precompute.
-fn finished(operation: Operation) -> Result<PrecomputeResponse, Error> {
-    let packed = match operation.result {
-        Some(operation::Result::Response(packed)) => packed,
-        Some(operation::Result::Error(status)) => return Err(status.into()),
-        None => return Err(Error::broken_contract("a finished operation without a result")),
-    };
-    if packed.type_url != PrecomputeResponse::type_url() {
-        return Err(Error::broken_contract(&format!("a precompute gave a {}", packed.type_url)));
-    }
-    PrecomputeResponse::decode(packed.value.as_slice())
-        .map_err(|fault| Error::broken_contract(&format!("malformed precompute result: {fault}")))
 }

@@ -14,14 +14,17 @@
 //! # }
 //! ```
 
+mod artifacts;
 mod client;
 mod closed_loop;
 mod error;
+mod operations;
 mod retry;
 
 pub use client::{Client, Options};
 pub use closed_loop::ClosedLoop;
 pub use error::{Error, FieldViolation};
+pub use operations::progress;
 pub use tonic::Code;
 /// The messages this client sends and receives.
-pub use vbar_proto::v1;
+pub use vbar_proto::{google::longrunning, v1};

@@ -24,17 +24,23 @@ use vbar_proto::{
         rpc,
     },
     v1::{
-        Artifact, ComputePlanRequest, ComputePlanResponse, ExportPlanRequest, ExportPlanResponse,
-        GetArtifactRequest, GetArtifactResponse, GetPlanRequest, GetPlanResponse,
-        GetServerInfoRequest, GetServerInfoResponse, ListPlansRequest, ListPlansResponse,
-        Measurement, PrecomputeRequest, PrecomputeResponse, Problem, StepRequest, StepResponse,
-        StepStreamRequest, StepStreamResponse, UploadPlanRequest, UploadPlanResponse,
+        Artifact, ComputePlanRequest, ComputePlanResponse, DownloadArtifactRequest,
+        DownloadArtifactResponse, ExportPlanRequest, ExportPlanResponse, GetArtifactRequest,
+        GetArtifactResponse, GetPlanRequest, GetPlanResponse, GetServerInfoRequest,
+        GetServerInfoResponse, ListArtifactsRequest, ListArtifactsResponse, ListPlansRequest,
+        ListPlansResponse, Measurement, PrecomputeMetadata, PrecomputeRequest, PrecomputeResponse,
+        Problem, SafetyReportRequest, SafetyReportResponse, SafetySummary, StepRequest,
+        StepResponse, StepStreamRequest, StepStreamResponse, UploadPlanRequest, UploadPlanResponse,
         guidance_service_server::{GuidanceService, GuidanceServiceServer},
         precompute_response::Outcome,
         step_stream_request::Controller,
         step_stream_response,
     },
 };
+
+/// The bytes of every artifact of this node, and their digest.
+const CONTENT: &[u8] = b"thought long";
+const CONTENT_SHA256: &str = "3c3bcb06cb45c69ef69f0865b796e76326f98d276d9c6df308a5cfc2aadd5af8";
 
 /// What the node does with one message.
 #[derive(Debug)]
@@ -92,11 +98,19 @@ impl Scripted {
             type_url: PrecomputeResponse::type_url(),
             value: made.encode_to_vec(),
         };
+        let metadata = PrecomputeMetadata {
+            shards_done: 10 - i32::try_from(*left).unwrap_or(10).min(10),
+            ..PrecomputeMetadata::default()
+        };
+        let metadata = prost_types::Any {
+            type_url: PrecomputeMetadata::type_url(),
+            value: metadata.encode_to_vec(),
+        };
         Operation {
             name: "operations/1".into(),
+            metadata: Some(metadata),
             done,
             result: done.then_some(operation::Result::Response(packed)),
-            ..Operation::default()
         }
     }
 }
@@ -104,6 +118,8 @@ impl Scripted {
 #[tonic::async_trait]
 impl GuidanceService for Scripted {
     type StepStreamStream = Pin<Box<dyn Stream<Item = Result<StepStreamResponse, Status>> + Send>>;
+    type DownloadArtifactStream =
+        Pin<Box<dyn Stream<Item = Result<DownloadArtifactResponse, Status>> + Send>>;
 
     async fn compute_plan(
         &self,
@@ -164,9 +180,50 @@ impl GuidanceService for Scripted {
         Ok(Response::new(GetArtifactResponse::default()))
     }
 
+    async fn list_artifacts(
+        &self,
+        request: Request<ListArtifactsRequest>,
+    ) -> Result<Response<ListArtifactsResponse>, Status> {
+        self.follow(&request).await?;
+        let next_page_token = request.into_inner().page_token;
+        Ok(Response::new(ListArtifactsResponse { artifacts: Vec::new(), next_page_token }))
+    }
+
+    /// Three bytes an attempt, then it breaks off; a digest of the artifact's own choice.
+    async fn download_artifact(
+        &self,
+        request: Request<DownloadArtifactRequest>,
+    ) -> Result<Response<Self::DownloadArtifactStream>, Status> {
+        self.follow(&request).await?;
+        let DownloadArtifactRequest { artifact_id, offset, .. } = request.into_inner();
+        let begin = usize::try_from(offset).unwrap();
+        let end = CONTENT.len().min(begin + 3);
+        let piece = DownloadArtifactResponse {
+            content: CONTENT[begin..end].into(),
+            offset,
+            size_bytes: CONTENT.len().try_into().unwrap(),
+            content_sha256: artifact_id,
+        };
+        let mut pieces = vec![Ok(piece)];
+        if end < CONTENT.len() {
+            pieces.push(Err(Status::unavailable("broken off")));
+        }
+        Ok(Response::new(Box::pin(tokio_stream::iter(pieces))))
+    }
+
     async fn step(&self, request: Request<StepRequest>) -> Result<Response<StepResponse>, Status> {
         self.follow(&request).await?;
         Ok(Response::new(StepResponse { step_index: 7, ..StepResponse::default() }))
+    }
+
+    async fn safety_report(
+        &self,
+        request: Request<SafetyReportRequest>,
+    ) -> Result<Response<SafetyReportResponse>, Status> {
+        self.follow(&request).await?;
+        let verdicts = request.into_inner().first_step_index;
+        let summary = Some(SafetySummary { verdicts, ..SafetySummary::default() });
+        Ok(Response::new(SafetyReportResponse { summary, ..SafetyReportResponse::default() }))
     }
 
     /// Each answer's controller state is the number of messages this node has seen.
@@ -326,6 +383,15 @@ async fn plan_calls_are_repeated_and_answered() {
     let request = ExportPlanRequest { plan_id: "p2".into(), ..ExportPlanRequest::default() };
     assert_eq!(client.export_plan(request).await.unwrap().file_name, "p2");
     assert_eq!(node.calls(), 2);
+}
+
+#[tokio::test]
+async fn safety_report_is_repeated_and_answered() {
+    let node = Scripted::new([unavailable()]);
+    let client = connected(&node).await;
+    let request = SafetyReportRequest { first_step_index: 7, ..SafetyReportRequest::default() };
+    let answer = client.safety_report(request).await.unwrap();
+    assert_eq!((answer.summary.unwrap().verdicts, node.calls()), (7, 2));
 }
 
 #[tokio::test]
@@ -522,6 +588,27 @@ async fn precompute_waits_until_done() {
         assert_eq!(artifact.artifact_id, "a1");
         assert_eq!(*node.looks_left.lock().unwrap(), 0);
     }
+}
+
+#[tokio::test]
+async fn precompute_reports_how_far_it_is() {
+    let node = Scripted::default();
+    *node.looks_left.lock().unwrap() = 3;
+    let client = connected(&node).await;
+    let mut reported = Vec::new();
+    let report = |metadata: &PrecomputeMetadata| reported.push(metadata.shards_done);
+    client.precompute_reporting(Problem::default(), report).await.unwrap();
+    assert_eq!(reported, [8, 9, 10, 10]);
+}
+
+#[tokio::test]
+async fn download_goes_on_where_it_broke_off_and_is_checked() {
+    let node = Scripted::default();
+    let client = connected(&node).await;
+    assert_eq!(client.download_artifact(CONTENT_SHA256).await.unwrap(), CONTENT);
+    assert_eq!(node.calls(), CONTENT.len().div_ceil(3));
+    let error = client.download_artifact("another digest").await.unwrap_err();
+    assert_eq!(error.code, Code::Internal, "{error}");
 }
 
 #[tokio::test]

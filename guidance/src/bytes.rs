@@ -102,6 +102,11 @@ impl<'a> Reader<'a> {
         DecodeError { offset: self.offset, what: what.into() }
     }
 
+    /// A tag that no `what` has.
+    pub(crate) fn unknown(&self, what: &str, tag: u8) -> DecodeError {
+        self.fault(format!("{what} {tag} is not known"))
+    }
+
     /// Fails if anything is left.
     pub(crate) fn end(&self) -> Result<(), DecodeError> {
         match self.bytes.len() - self.offset {

@@ -37,8 +37,30 @@ pub struct Config {
     pub shutdown_grace: Duration,
     /// Where artifacts are kept.
     pub store: StoreLocation,
+    /// With a directory: a write reaches the disk before it is acknowledged. Without, a power
+    /// failure (never a killed process) can take the last half minute.
+    pub store_sync: bool,
     /// Decoded artifacts kept in memory, bytes.
     pub cache_bytes_max: usize,
+    /// Shards of precomputes at once, on threads beside those for calls; a processor fewer than
+    /// there are leaves room for steps.
+    pub job_threads: usize,
+    /// Precomputes that are not done; more are refused.
+    pub jobs_unfinished_max: usize,
+    /// Longest run of one precompute.
+    pub job_time_max: Duration,
+    /// How often a precompute is begun, when the node ends in its midst, before it is given up.
+    pub job_attempts_max: u32,
+    /// How long `Precompute` waits for the end before it answers that it is under way.
+    pub precompute_wait: Duration,
+    /// How long a finished operation and a request id are remembered.
+    pub operation_lifetime: Duration,
+    /// How long an artifact is kept after its last use.
+    pub artifact_lifetime: Duration,
+    /// Most bytes of artifacts kept; more are refused until some expire.
+    pub artifact_bytes_max: u64,
+    /// Callers that follow operations as events at once.
+    pub watchers_max: usize,
     /// Limits on what a request may ask for.
     pub limits: Limits,
 }
@@ -55,6 +77,8 @@ pub enum StoreLocation {
     Directory(PathBuf),
 }
 
+const DAY: Duration = Duration::from_secs(24 * 3600);
+
 impl Default for Config {
     fn default() -> Self {
         Self {
@@ -70,7 +94,17 @@ impl Default for Config {
             receive_time_max: Duration::from_secs(10),
             shutdown_grace: Duration::from_secs(10),
             store: StoreLocation::Memory { bytes_max: 256 << 20 },
+            store_sync: true,
             cache_bytes_max: 256 << 20,
+            job_threads: thread::available_parallelism().map_or(1, |n| n.get() - 1).max(1),
+            jobs_unfinished_max: 64,
+            job_time_max: Duration::from_secs(4 * 3600),
+            job_attempts_max: 5,
+            precompute_wait: Duration::from_secs(1),
+            operation_lifetime: 7 * DAY,
+            artifact_lifetime: 30 * DAY,
+            artifact_bytes_max: 16 << 30,
+            watchers_max: 64,
             limits: Limits::default(),
         }
     }
@@ -117,6 +151,11 @@ impl Config {
         count("request_bytes_max", self.request_bytes_max, 1 << 30);
         count("connections_max", self.connections_max, 1 << 20);
         count("streams_max", usize::try_from(self.streams_max).unwrap_or(usize::MAX), 1 << 16);
+        count("job_threads", self.job_threads, 1024);
+        count("jobs_unfinished_max", self.jobs_unfinished_max, 100_000);
+        let attempts = usize::try_from(self.job_attempts_max).unwrap_or(usize::MAX);
+        count("job_attempts_max", attempts, 1_000_000);
+        count("watchers_max", self.watchers_max, 100_000);
         count("limits.horizon_max", self.limits.horizon_max, 100_000);
         count("limits.generators_max", self.limits.generators_max, 10_000);
         count("limits.states_max", self.limits.states_max, 1000);
@@ -127,15 +166,19 @@ impl Config {
         count("limits.report_states_max", self.limits.report_states_max, 1_000_000);
         count("limits.sampled_rows_max", self.limits.sampled_rows_max, 100_000_000);
         count("limits.plant_vertices_max", self.limits.plant_vertices_max, 4096);
-        let hour = Duration::from_secs(3600);
-        let mut time = |setting, value: Duration, least: Duration| {
-            let expected = format!("{least:?} to {hour:?}");
-            check((least..=hour).contains(&value), setting, &expected, format!("{value:?}"));
+        let mut time = |setting, value: Duration, (least, most): (Duration, Duration)| {
+            let expected = format!("{least:?} to {most:?}");
+            check((least..=most).contains(&value), setting, &expected, format!("{value:?}"));
         };
-        time("compute_wait", self.compute_wait, Duration::ZERO);
-        time("computation_time_max", self.computation_time_max, Duration::from_millis(1));
-        time("receive_time_max", self.receive_time_max, Duration::from_millis(1));
-        time("shutdown_grace", self.shutdown_grace, Duration::ZERO);
+        let (tick, hour) = (Duration::from_millis(1), Duration::from_secs(3600));
+        time("compute_wait", self.compute_wait, (Duration::ZERO, hour));
+        time("computation_time_max", self.computation_time_max, (tick, hour));
+        time("receive_time_max", self.receive_time_max, (tick, hour));
+        time("shutdown_grace", self.shutdown_grace, (Duration::ZERO, hour));
+        time("precompute_wait", self.precompute_wait, (Duration::ZERO, hour));
+        time("job_time_max", self.job_time_max, (tick, 30 * DAY));
+        time("operation_lifetime", self.operation_lifetime, (tick, 3650 * DAY));
+        time("artifact_lifetime", self.artifact_lifetime, (tick, 3650 * DAY));
         if let StoreLocation::Memory { bytes_max } = self.store {
             check(bytes_max > 0, "store_bytes_max", "at least 1", bytes_max.to_string());
         }
@@ -163,7 +206,17 @@ pub struct Settings {
     pub store_directory: Option<PathBuf>,
     /// Most bytes of a store in memory.
     pub store_bytes_max: Option<usize>,
+    pub store_sync: Option<bool>,
     pub cache_bytes_max: Option<usize>,
+    pub job_threads: Option<usize>,
+    pub jobs_unfinished_max: Option<usize>,
+    pub job_time_max_s: Option<f64>,
+    pub job_attempts_max: Option<u32>,
+    pub precompute_wait_s: Option<f64>,
+    pub operation_lifetime_s: Option<f64>,
+    pub artifact_lifetime_s: Option<f64>,
+    pub artifact_bytes_max: Option<u64>,
+    pub watchers_max: Option<usize>,
     pub horizon_max: Option<usize>,
     pub generators_max: Option<usize>,
     pub states_max: Option<usize>,
@@ -207,7 +260,17 @@ macro_rules! for_each_setting {
             shutdown_grace_s,
             store_directory,
             store_bytes_max,
+            store_sync,
             cache_bytes_max,
+            job_threads,
+            jobs_unfinished_max,
+            job_time_max_s,
+            job_attempts_max,
+            precompute_wait_s,
+            operation_lifetime_s,
+            artifact_lifetime_s,
+            artifact_bytes_max,
+            watchers_max,
             horizon_max,
             generators_max,
             states_max,
@@ -321,7 +384,29 @@ impl Settings {
             ),
             shutdown_grace: time("shutdown_grace_s", self.shutdown_grace_s, config.shutdown_grace),
             store,
+            store_sync: self.store_sync.unwrap_or(config.store_sync),
             cache_bytes_max: self.cache_bytes_max.unwrap_or(config.cache_bytes_max),
+            job_threads: self.job_threads.unwrap_or(config.job_threads),
+            jobs_unfinished_max: self.jobs_unfinished_max.unwrap_or(config.jobs_unfinished_max),
+            job_time_max: time("job_time_max_s", self.job_time_max_s, config.job_time_max),
+            job_attempts_max: self.job_attempts_max.unwrap_or(config.job_attempts_max),
+            precompute_wait: time(
+                "precompute_wait_s",
+                self.precompute_wait_s,
+                config.precompute_wait,
+            ),
+            operation_lifetime: time(
+                "operation_lifetime_s",
+                self.operation_lifetime_s,
+                config.operation_lifetime,
+            ),
+            artifact_lifetime: time(
+                "artifact_lifetime_s",
+                self.artifact_lifetime_s,
+                config.artifact_lifetime,
+            ),
+            artifact_bytes_max: self.artifact_bytes_max.unwrap_or(config.artifact_bytes_max),
+            watchers_max: self.watchers_max.unwrap_or(config.watchers_max),
             limits: Limits {
                 horizon_max: self.horizon_max.unwrap_or(config.limits.horizon_max),
                 generators_max: self.generators_max.unwrap_or(config.limits.generators_max),

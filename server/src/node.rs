@@ -1,12 +1,18 @@
 //! A node: the port, its connections, and their end.
 
-use std::{convert::Infallible, io, net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    convert::Infallible,
+    io,
+    net::SocketAddr,
+    sync::{Arc, Weak},
+    time::Duration,
+};
 
 use crate::{
     compute::Compute,
     config::{Config, ConfigFault, StoreLocation},
     service::Service,
-    store::{DirectoryStore, MemoryStore, RecordStore},
+    store::{DirectoryStore, MemoryStore, Store, StoreError, Syncing},
     telemetry::Metrics,
     transport::{Front, TransportOptions},
     wire::InfoAnswer,
@@ -28,6 +34,7 @@ use tokio::{
 pub struct Node {
     local_address: SocketAddr,
     draining: watch::Sender<bool>,
+    service: Arc<Service>,
     task: JoinHandle<()>,
 }
 
@@ -71,12 +78,6 @@ impl Node {
         let refused = |source| StartError::Listen { address, source };
         let listener = TcpListener::bind(address).await.map_err(refused)?;
         let local_address = listener.local_addr().map_err(refused)?;
-        let store: Arc<dyn RecordStore> = match &config.store {
-            StoreLocation::Memory { bytes_max } => Arc::new(MemoryStore::new(*bytes_max)),
-            StoreLocation::Directory(root) => Arc::new(
-                DirectoryStore::open(root).map_err(|fault| StartError::Store(fault.to_string()))?,
-            ),
-        };
         let metrics = Arc::new(Metrics::new());
         let compute = Compute::start(
             config.compute_threads,
@@ -91,19 +92,32 @@ impl Node {
             compute_threads: config.compute_threads,
             computation_time_max: config.computation_time_max,
         };
-        let cache = config.cache_bytes_max;
-        let service = Arc::new(Service::new(compute, store, cache, Arc::clone(&metrics), info));
+        let service = {
+            let (config, metrics) = (config.clone(), Arc::clone(&metrics));
+            let open = move || {
+                let store = store(&config).map_err(io::Error::other)?;
+                Service::open(compute, store, &config, metrics, info)
+            };
+            // It reads what the store remembers, and may wait for a process that is just ending.
+            let opened = tokio::task::spawn_blocking(open).await.map_err(io::Error::other);
+            opened
+                .and_then(|opened| opened)
+                .map_err(|fault| StartError::Store(fault.to_string()))?
+        };
+        let service = Arc::new(service);
+        let rest = config.artifact_lifetime.min(config.operation_lifetime) / 8;
+        tokio::spawn(sweep(Arc::downgrade(&service), rest));
         let (draining, drain) = watch::channel(false);
         let options = TransportOptions {
             request_bytes_max: config.request_bytes_max,
             receive_time_max: config.receive_time_max,
             draining: drain.clone(),
         };
-        let front = Front::new(service, options).await;
+        let front = Front::new(Arc::clone(&service), options).await;
         tracing::info!(%local_address, "listening");
         let port = Port { front, metrics, config };
         let task = tokio::spawn(port.serve(listener, drain));
-        Ok(Self { local_address, draining, task })
+        Ok(Self { local_address, draining, service, task })
     }
 
     /// Where it listens.
@@ -112,12 +126,37 @@ impl Node {
         self.local_address
     }
 
-    /// Stops: readiness off, no new connections, closed loops told to go elsewhere, calls under
-    /// way finished within the grace period.
+    /// Stops: readiness off, no new connections, closed loops told to go elsewhere, precomputes
+    /// handed back to the store, calls under way finished within the grace period.
     pub async fn shutdown(self) {
         self.draining.send_replace(true);
+        let service = self.service;
+        if let Err(fault) = tokio::task::spawn_blocking(move || service.stop()).await {
+            tracing::error!(%fault, "jobs were not handed back");
+        }
         if let Err(fault) = self.task.await {
             tracing::error!(%fault, "the node did not stop well");
+        }
+    }
+}
+
+fn store(config: &Config) -> Result<Arc<dyn Store>, StoreError> {
+    let syncing = if config.store_sync { Syncing::EveryWrite } else { Syncing::LeftToTheSystem };
+    Ok(match &config.store {
+        StoreLocation::Memory { bytes_max } => Arc::new(MemoryStore::new(*bytes_max)),
+        StoreLocation::Directory(root) => Arc::new(DirectoryStore::open(root, syncing)?),
+    })
+}
+
+/// Sweeps now and then for as long as the service lives, with `rest` in between.
+async fn sweep(service: Weak<Service>, rest: Duration) {
+    const SHORTEST: Duration = Duration::from_millis(50);
+    const LONGEST: Duration = Duration::from_secs(60);
+    loop {
+        tokio::time::sleep(rest.clamp(SHORTEST, LONGEST)).await;
+        let Some(service) = service.upgrade() else { return };
+        if let Err(fault) = tokio::task::spawn_blocking(move || service.sweep()).await {
+            tracing::error!(%fault, "sweeping");
         }
     }
 }

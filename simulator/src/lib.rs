@@ -6,12 +6,14 @@
 //!
 //! A mission file ([`MissionFile`]) says what the service is asked and against which truth it is
 //! flown. Closed loops ([`Mission`]) are flown by [`simulate`], plans ([`PlanMission`]) by
-//! [`fly_plans`], loops under sampled chance constraints ([`SamplingMission`]) by [`fly_sampling`],
-//! many runs at once; the [`Report`], [`PlanReport`] or [`SamplingReport`] holds every trace, the
-//! statistics and the published figures; [`draw`], [`draw_plans`] and [`draw_sampling`] make
-//! pictures of it.
+//! [`fly_plans`], loops that can be aborted ([`AbortMission`]) by [`fly_aborts`], loops under
+//! sampled chance constraints ([`SamplingMission`]) by [`fly_sampling`], many runs at once; the
+//! [`Report`], [`PlanReport`], [`AbortReport`] or [`SamplingReport`] holds every trace, the
+//! statistics and the published figures; [`draw`], [`draw_plans`], [`draw_aborts`] and
+//! [`draw_sampling`] make pictures of it.
 
 mod campaign;
+mod clearance;
 mod mission;
 mod pictures;
 mod plant;
@@ -20,6 +22,10 @@ mod report;
 pub use campaign::{
     Campaign, Flight, Progress, ProgressBar, RunOptions, SchemeChoice, Silent, SimulationError,
     SweepPoint,
+    abort::{
+        AbortCampaign, AbortFlight, AbortOutcome, AbortRunOptions, AbortSample, AbortStep, Drift,
+        FlownFailure, ModeCounts, Origin, UnsafeSets, fly_aborts,
+    },
     flight::{Outcome, Sample, Step, VIOLATION_TOLERANCE_ND},
     plan::{
         FlownBurn, OpenLoopEnd, PlanAnswer, PlanCampaign, PlanFlight, PlanRow, PlanRunOptions,
@@ -33,13 +39,18 @@ pub use campaign::{
     simulate,
 };
 pub use mission::{
-    Mission, MissionError, MissionFile, PlanChanges, PlanMission, Published, PublishedAxes,
-    PublishedEffort, RUNS_MAX, SamplingMission, metric_name, metric_named, sampling_scheme_name,
-    sampling_scheme_named,
+    AbortCase, AbortMission, AbortSources, Mission, MissionError, MissionFile, PlanChanges,
+    PlanMission, Published, PublishedAxes, PublishedEffort, RUNS_MAX, SamplingMission, metric_name,
+    metric_named, sampling_scheme_name, sampling_scheme_named,
 };
-pub use pictures::{PictureError, draw, plan::draw_plans, sampling::draw_sampling};
+pub use pictures::{
+    PictureError, abort::draw_aborts, draw, plan::draw_plans, sampling::draw_sampling,
+};
 pub use report::{
     Report, Statistics, Summary,
+    abort::{
+        AbortReport, AbortSummary, DriftFigures, FailureFigures, PathComparison, PhaseFigures,
+    },
     plan::{PlanReport, PlanSummary, plan_rows_json, plan_rows_text, plan_text},
     sampling::{SamplingReport, SamplingSummary},
 };
@@ -59,6 +70,14 @@ mod tests {
     /// One file of a family of reference numbers (see `tests/golden`).
     pub(crate) fn golden_file(family: &str, file: &str) -> serde_json::Value {
         let path = format!("{}/../tests/golden/{family}/{file}", env!("CARGO_MANIFEST_DIR"));
+        let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
+        serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
+    }
+
+    /// One case of abort safety (see `tests/golden/abort_safe`).
+    pub(crate) fn abort_case(name: &str) -> serde_json::Value {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/abort_safe");
+        let path = format!("{folder}/{name}.json");
         let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
         serde_json::from_str(&text).unwrap_or_else(|e| panic!("{path}: {e}"))
     }

@@ -1,6 +1,7 @@
 //! The methods: one folder each, one trait, one list.
 
 pub mod abort_safe;
+mod canonical;
 pub mod disturbance_feedback;
 pub mod offline_sampling;
 pub mod variable_horizon;
@@ -19,14 +20,16 @@ pub enum Method {
     VariableHorizon,
     /// Fixed-time rendezvous plans with disturbance feedback.
     DisturbanceFeedback,
+    /// Rendezvous that can be aborted at every step.
+    AbortSafe,
     /// Stochastic MPC sampled offline, and its baselines.
     OfflineSampling,
 }
 
 impl Method {
     /// Every method.
-    pub const ALL: [Self; 3] =
-        [Self::VariableHorizon, Self::DisturbanceFeedback, Self::OfflineSampling];
+    pub const ALL: [Self; 4] =
+        [Self::VariableHorizon, Self::DisturbanceFeedback, Self::AbortSafe, Self::OfflineSampling];
 
     /// Name on the wire and in identifiers.
     #[must_use]
@@ -34,6 +37,7 @@ impl Method {
         match self {
             Self::VariableHorizon => "variable_horizon",
             Self::DisturbanceFeedback => "disturbance_feedback",
+            Self::AbortSafe => "abort_safe",
             Self::OfflineSampling => "offline_sampling",
         }
     }
@@ -44,6 +48,7 @@ impl Method {
         match self {
             Self::VariableHorizon => variable_horizon::VERSION,
             Self::DisturbanceFeedback => disturbance_feedback::VERSION,
+            Self::AbortSafe => abort_safe::VERSION,
             Self::OfflineSampling => offline_sampling::VERSION,
         }
     }
@@ -51,7 +56,7 @@ impl Method {
 
 /// Folders of methods whose mathematics stands here and that no node serves yet: contract, wire and
 /// missions are to come. A served method leaves this list for [`Method`]; `tidy` knows both.
-pub const NOT_YET_SERVED: [&str; 1] = ["abort_safe"];
+pub const NOT_YET_SERVED: [&str; 0] = [];
 
 /// A method: think long once (`prepare` in shards, then `merge`), then decide fast many times.
 ///

@@ -2,7 +2,11 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use crate::sets::{CentredEllipsoid, Polytope};
+use crate::{
+    matrices::symmetric_eigenvalues,
+    program::{HalfSpaces, nearest_point_of_polytope},
+    sets::{CentredEllipsoid, Polytope},
+};
 
 /// A region of positions around the target's centre of mass, RTN.
 #[derive(Debug, Clone, PartialEq)]
@@ -146,6 +150,46 @@ impl AvoidanceSet {
             }
         };
         Self::new(region, self.speed_max_m_s * speed)
+    }
+
+    /// Distance from a position to the region, metres; 0 inside.
+    #[must_use]
+    pub fn distance_m(&self, position: &Vector3<f64>) -> f64 {
+        let point = DVector::from_column_slice(position.as_slice());
+        let away = |nearest: DVector<f64>| (nearest - &point).norm();
+        if let Some(precision) = self.position_precision() {
+            let precision = DMatrix::from_fn(3, 3, |i, j| precision[(i, j)]);
+            return CentredEllipsoid::from_precision(precision)
+                .map_or(f64::INFINITY, |region| away(region.nearest_point(&point)));
+        }
+        let lifted = self.outer_polytope();
+        let of_positions = |&r: &usize| (0..3).any(|c| lifted.normals()[(r, c)] != 0.0);
+        let rows: Vec<usize> = (0..lifted.offsets().len()).filter(of_positions).collect();
+        let normals = lifted.normals().select_rows(&rows).columns(0, 3).into_owned();
+        let offsets = lifted.offsets().select_rows(&rows);
+        let sides = HalfSpaces { normals: &normals, offsets: &offsets };
+        nearest_point_of_polytope(sides, &point).map_or(f64::INFINITY, away)
+    }
+
+    /// Twice the distance from the target to the nearest point of the region's border, metres: no
+    /// slab through the target that the region holds is wider.
+    #[must_use]
+    pub fn narrowest_width_m(&self) -> f64 {
+        2.0 * match &self.region {
+            AvoidanceRegion::SemiAxes(lengths) | AvoidanceRegion::HalfWidths(lengths) => {
+                lengths.min()
+            }
+            AvoidanceRegion::Radius(radius) => *radius,
+            AvoidanceRegion::ShapeMatrix(shape) => {
+                let squares = symmetric_eigenvalues(&DMatrix::from_fn(3, 3, |i, j| shape[(i, j)]));
+                squares[0].sqrt()
+            }
+            AvoidanceRegion::Faces { normals, offsets } => normals
+                .row_iter()
+                .zip(offsets.iter())
+                .map(|(normal, offset)| offset / normal.norm())
+                .fold(f64::INFINITY, f64::min),
+        }
     }
 
     /// The speed above which an approach passes through the region unseen, if `plausible_m_s`, the

@@ -204,6 +204,95 @@ impl KeplerOrbit {
             velocity_m_s: InFrame::new(inertial_from_perifocal * velocity),
         })
     }
+
+    /// Inertial states at equal times, the first one `start` after the mission's start; `None` if
+    /// the orientation is unknown.
+    ///
+    /// Several times faster than one state after the other: the eccentric anomaly is carried on
+    /// by its Taylor series, so that Kepler's equation needs a sine and a cosine a state.
+    pub fn inertial_states(
+        &self,
+        start: Seconds,
+        spacing: Seconds,
+    ) -> Option<impl Iterator<Item = InertialState>> {
+        let orientation = self.orientation?;
+        let (a, e, n) = (self.semi_major_axis_m, self.eccentricity, self.mean_motion_rad_s());
+        let (b, axes) = (a * libm::sqrt((1.0 - e) * (1.0 + e)), orientation.axes);
+        let inertial_from_perifocal = orientation.inertial_from_perifocal();
+        let mean = mean_from_true(e, self.true_anomaly_rad) + n * start.seconds();
+        Some(EccentricAnomalies::new(e, mean, n * spacing.seconds()).map(move |(sine, cosine)| {
+            let speed = n / (1.0 - e * cosine);
+            let position = Vector3::new(a * (cosine - e), b * sine, 0.0);
+            let velocity = Vector3::new(-a * sine * speed, b * cosine * speed, 0.0);
+            InertialState {
+                axes,
+                position_m: InFrame::new(inertial_from_perifocal * position),
+                velocity_m_s: InFrame::new(inertial_from_perifocal * velocity),
+            }
+        }))
+    }
+}
+
+/// Sines and cosines of the eccentric anomaly at equal steps of the mean one.
+struct EccentricAnomalies {
+    e: f64,
+    first_mean: f64,
+    step: f64,
+    count: usize,
+    eccentric: f64,
+    sine: f64,
+    cosine: f64,
+}
+
+/// A correction of the eccentric anomaly below this changes its sine and cosine by their Taylor
+/// series to the last bit: what is left out is of the third order.
+const SMALL_CORRECTION_RAD: f64 = 3e-6;
+
+impl EccentricAnomalies {
+    fn new(e: f64, first_mean: f64, step: f64) -> Self {
+        Self { e, first_mean, step, count: 0, eccentric: 0.0, sine: 0.0, cosine: 0.0 }
+    }
+
+    /// From the anomaly before: E' = 1 / (1 - e cos E) with respect to the mean one, and the two
+    /// derivatives of that. `None` if the series has not come close enough.
+    fn carried_on(&self, mean: f64) -> Option<(f64, f64, f64)> {
+        let e = self.e;
+        let slope = 1.0 / (1.0 - e * self.cosine);
+        let (es, ec) = (e * self.sine, e * self.cosine);
+        let second = -es * slope * slope * slope;
+        let third = (3.0 * es * es * slope - ec) * slope * slope * slope * slope;
+        let step = self.step;
+        let guess =
+            self.eccentric + step * (slope + step * (0.5 * second + step * third * (1.0 / 6.0)));
+        let (sine, cosine) = (libm::sin(guess), libm::cos(guess));
+        let rest = 1.0 - e * cosine;
+        let excess = guess - e * sine - mean;
+        let newton = excess / rest;
+        // Halley's step, whose error is of the third order too.
+        let change = -excess / (rest - 0.5 * newton * e * sine);
+        (change.abs() <= SMALL_CORRECTION_RAD).then(|| {
+            let half = 0.5 * change * change;
+            let turned =
+                (sine + cosine * change - sine * half, cosine - sine * change - cosine * half);
+            (guess + change, turned.0, turned.1)
+        })
+    }
+}
+
+impl Iterator for EccentricAnomalies {
+    type Item = (f64, f64);
+
+    fn next(&mut self) -> Option<(f64, f64)> {
+        let mean = self.first_mean + self.count as f64 * self.step;
+        let carried = if self.count > 0 { self.carried_on(mean) } else { None };
+        (self.eccentric, self.sine, self.cosine) = carried.unwrap_or_else(|| {
+            let (turns, within) = revolutions(mean);
+            let eccentric = eccentric_from_mean(self.e, within);
+            (turns * TAU + eccentric, libm::sin(eccentric), libm::cos(eccentric))
+        });
+        self.count += 1;
+        Some((self.sine, self.cosine))
+    }
 }
 
 impl Orientation {

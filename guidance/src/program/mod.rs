@@ -30,7 +30,9 @@ pub use quadratic::{
     QuadraticProgram, QuadraticResiduals, QuadraticSolution, prove_infeasible, verify_quadratic,
 };
 pub(crate) use quadratic::{ActiveSet, Entry};
-pub use regulator::{CondensedRegulator, RegulatorAnswer, RegulatorProgram, Softness, StateCut};
+pub use regulator::{
+    CondensedRegulator, RegulatorAnswer, RegulatorProgram, RelaxedRows, Softness, StateCut,
+};
 pub use second_order::{Affine, ConeProgram, ConeSolution};
 pub use separation::{
     HalfSpaces, Separation, SeparationOutcome, nearest_point_of_polytope, polytope_is_empty,

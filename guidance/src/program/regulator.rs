@@ -4,8 +4,8 @@
 use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, SVector, Vector3};
 
 use super::{
-    ActiveRow, Clarabel, DenseRows, DualActiveSet, NotPositiveDefinite, QuadraticCost,
-    QuadraticProgram, QuadraticSolution, Status,
+    ActiveRow, Affine, Clarabel, ConeProgram, DenseRows, DualActiveSet, NotPositiveDefinite,
+    QuadraticCost, QuadraticProgram, QuadraticSolution, Status,
 };
 use crate::{
     budget::{Budget, Interruption},
@@ -68,6 +68,36 @@ pub struct Softness {
     pub quadratic: f64,
 }
 
+/// Responses of the states to the forces before them.
+struct Responses {
+    stages: usize,
+    /// A_{i-1} .. A_{l+1} B_l basis (unused columns 0), for i = l + 1 .. N, l by l.
+    maps: Vec<SMatrix<f64, 6, 3>>,
+}
+
+impl Responses {
+    fn new(program: &RegulatorProgram<'_>) -> Self {
+        let (n, d) = (program.horizon(), program.inputs());
+        let basis = Matrix3::from_fn(|i, c| if c < d { program.basis[(i, c)] } else { 0.0 });
+        let mut maps = Vec::with_capacity(n * (n + 1) / 2);
+        for l in 0..n {
+            let mut response = product_fixed(&program.steps[l].1, &basis);
+            maps.push(response);
+            for (a, _) in &program.steps[l + 1..] {
+                response = product_fixed(a, &response);
+                maps.push(response);
+            }
+        }
+        Self { stages: n, maps }
+    }
+
+    /// Of x_i to the forces of stage l < i.
+    fn of(&self, l: usize, i: usize) -> &SMatrix<f64, 6, 3> {
+        // Stages before l have N, N - 1, .. responses.
+        &self.maps[l * self.stages - l * l.saturating_sub(1) / 2 + i - l - 1]
+    }
+}
+
 /// The program over w: z'Hz / 2 + g'z with rows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CondensedRegulator {
@@ -79,6 +109,15 @@ pub struct CondensedRegulator {
     pub rows: DenseRows,
     /// Right sides.
     pub offsets: Vec<f64>,
+}
+
+/// Which rows may give way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RelaxedRows {
+    /// Limits of the forces.
+    Facets,
+    /// What the states must clear.
+    Cuts,
 }
 
 /// What came of it.
@@ -124,7 +163,8 @@ impl RegulatorProgram<'_> {
     /// [`NotPositiveDefinite`] if R is not, on the span of the forces.
     pub fn condense(&self) -> Result<CondensedRegulator, NotPositiveDefinite> {
         let forces = self.horizon() * self.inputs();
-        let mut hessian = self.force_hessian();
+        let responses = Responses::new(self);
+        let mut hessian = self.force_hessian(&responses);
         let mut gradient = self.force_gradient();
         if let Some(softness) = self.softness {
             for i in forces..self.variables() {
@@ -132,7 +172,7 @@ impl RegulatorProgram<'_> {
                 gradient[i] = softness.linear;
             }
         }
-        let (rows, offsets) = self.rows();
+        let (rows, offsets) = self.rows(&responses);
         Ok(CondensedRegulator { cost: QuadraticCost::new(hessian)?, gradient, rows, offsets })
     }
 
@@ -144,32 +184,29 @@ impl RegulatorProgram<'_> {
         self.steps.iter().map(|(_, b)| map(b)).collect()
     }
 
-    /// 2 (S' diag(L .. M) S + diag(basis' R basis)): each column is a response carried forward
-    /// and its costate carried back.
-    fn force_hessian(&self) -> DMatrix<f64> {
+    /// 2 (S' diag(L .. M) S + diag(basis' R basis)). What follows stage j + 1 costs x'P x there
+    /// with P_N = M, P_j = L + A_j'P A_j, so the block of stages j >= l is B_j'P_{j+1} times the
+    /// response of x_{j+1} to the forces of stage l.
+    fn force_hessian(&self, responses: &Responses) -> DMatrix<f64> {
         let (n, d) = (self.horizon(), self.inputs());
         let maps = self.input_maps();
         let mut hessian = DMatrix::zeros(self.variables(), self.variables());
-        let mut response = vec![SVector::<f64, 6>::zeros(); n + 1];
-        for l in 0..n {
-            for c in 0..d {
-                response[l + 1] = maps[l][c];
-                for i in l + 1..n {
-                    response[i + 1] = product_fixed(&self.steps[i].0, &response[i]);
-                }
-                let mut costate = product_fixed(self.terminal_cost, &response[n]);
-                for j in (l..n).rev() {
-                    for (e, map) in maps[j].iter().enumerate() {
-                        let value = 2.0 * (0..6).map(|i| map[i] * costate[i]).sum::<f64>();
+        let mut cost_to_go = *self.terminal_cost;
+        for j in (0..n).rev() {
+            for (e, map) in maps[j].iter().enumerate() {
+                let pull = product_fixed(&cost_to_go, map) * 2.0;
+                for l in 0..=j {
+                    let response = responses.of(l, j + 1);
+                    for c in 0..d {
+                        let value: f64 = (0..6).map(|i| pull[i] * response[(i, c)]).sum();
                         hessian[(j * d + e, l * d + c)] = value;
                         hessian[(l * d + c, j * d + e)] = value;
                     }
-                    if j > l {
-                        costate = product_fixed(self.stage_cost, &response[j])
-                            + transposed_fixed_product(&self.steps[j].0, &costate);
-                    }
                 }
             }
+            let a = &self.steps[j].0;
+            cost_to_go =
+                self.stage_cost + transposed_fixed_product(a, &product_fixed(&cost_to_go, a));
         }
         for c in 0..d {
             for e in 0..d {
@@ -203,9 +240,8 @@ impl RegulatorProgram<'_> {
         gradient
     }
 
-    fn rows(&self) -> (DenseRows, Vec<f64>) {
+    fn rows(&self, responses: &Responses) -> (DenseRows, Vec<f64>) {
         let (n, d, variables) = (self.horizon(), self.inputs(), self.variables());
-        let maps = self.input_maps();
         let mut rows = DenseRows::new(variables);
         let mut offsets = Vec::new();
         let mut row = vec![0.0; variables];
@@ -220,12 +256,12 @@ impl RegulatorProgram<'_> {
         let free = self.states(&vec![*self.origin; n]);
         for (i, cut) in self.cuts.iter().enumerate() {
             row.fill(0.0);
-            let mut normal = cut.normal;
-            for j in (0..cut.stage.min(n)).rev() {
-                for (c, map) in maps[j].iter().enumerate() {
-                    row[j * d + c] = -(0..6).map(|r| normal[r] * map[r]).sum::<f64>();
+            let stage = cut.stage.min(n);
+            for j in 0..stage {
+                let response = responses.of(j, stage);
+                for c in 0..d {
+                    row[j * d + c] = -(0..6).map(|r| cut.normal[r] * response[(r, c)]).sum::<f64>();
                 }
-                normal = transposed_fixed_product(&self.steps[j].0, &normal);
             }
             if self.softness.is_some() {
                 row[n * d + i] = -1.0;
@@ -285,6 +321,44 @@ impl RegulatorProgram<'_> {
             return Ok(self.answer(&solution, false));
         }
         Ok(self.answer(&Clarabel.solve_quadratic(&program), true))
+    }
+
+    /// The least t >= 0 that, added to the right side of every cut or of every facet, lets the
+    /// program have an answer; recomputed from the forces that show it. `None` if the solver
+    /// fails. Cuts at stage 0, which no force changes, count as the others.
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn least_relaxation(
+        &self,
+        condensed: &CondensedRegulator,
+        relaxed: RelaxedRows,
+        budget: Budget<'_>,
+    ) -> Result<Option<f64>, Interruption> {
+        let facet_rows = self.horizon() * self.facet_offsets.len();
+        let forces = self.horizon() * self.inputs();
+        let gives_way = |row: usize| (row < facet_rows) == (relaxed == RelaxedRows::Facets);
+        let rows = facet_rows + self.cuts.len();
+        let mut program = ConeProgram::default();
+        let first = program.variables(forces + 1);
+        program.add_linear_cost(first + forces, 1.0);
+        let row = |row: usize| {
+            let normal = &condensed.rows.normal(row)[..forces];
+            let entries = normal.iter().enumerate().map(|(c, a)| (first + c, -a));
+            let slack = gives_way(row).then_some((first + forces, 1.0));
+            Affine { constant: condensed.offsets[row], entries: entries.chain(slack).collect() }
+        };
+        let nonnegative = Affine { constant: 0.0, entries: vec![(first + forces, 1.0)] };
+        let limits: Vec<Affine> = (0..rows).map(row).chain([nonnegative]).collect();
+        program.nonnegative(&limits);
+        let solution = program.solve(budget)?;
+        let violation = |row: usize| {
+            let normal = &condensed.rows.normal(row)[..forces];
+            let product: f64 = normal.iter().zip(&solution.x).map(|(a, x)| a * x).sum();
+            product - condensed.offsets[row]
+        };
+        let solved = matches!(solution.status, Status::Optimal | Status::Inaccurate);
+        Ok(solved.then(|| (0..rows).filter(|&r| gives_way(r)).map(violation).fold(0.0, f64::max)))
     }
 
     fn answer(&self, solution: &QuadraticSolution, by_general_solver: bool) -> RegulatorAnswer {

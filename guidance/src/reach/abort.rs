@@ -3,7 +3,10 @@
 
 use nalgebra::{SMatrix, Vector3};
 
-use super::flight::{Closest, Flight};
+use super::{
+    clearance::Outside,
+    flight::{Closest, Flight},
+};
 use crate::{
     budget::{Budget, Interruption},
     dynamics::{PeriodicPlant, RelativeVector},
@@ -37,6 +40,8 @@ pub struct AbortQuestion<'a> {
     pub horizon: usize,
     /// Most linear programs that the search may solve.
     pub programs_max: usize,
+    /// Between the instants too: only a sequence that stays outside throughout is an answer.
+    pub throughout: bool,
 }
 
 /// What is known about an abort.
@@ -60,14 +65,20 @@ pub enum AbortVerdict {
 /// An abort sequence.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Abort {
-    /// Throttle of each thruster, 0 to 1, step by step; failed ones are 0.
+    /// Throttle of each thruster, 0 to 1, step by step up to the last that thrusts; failed ones
+    /// are 0. Then the craft drifts.
     pub throttles: Vec<Vec<f64>>,
-    /// The resulting forces, newtons, RTN, one a step.
+    /// The resulting forces, newtons, RTN, of the same steps.
     pub forces_n: Vec<Vector3<f64>>,
-    /// Where it leads, at every instant.
+    /// Steps for which it was verified to keep out.
+    pub horizon: usize,
+    /// Where it leads, at every instant of the horizon.
     pub flight: Flight,
-    /// Least over the instants of the largest excess over a face, in parts of that face's offset.
+    /// Least over the instants of the largest excess over a face, in parts of that face's offset;
+    /// of an ellipsoid, the gauge less 1.
     pub margin: f64,
+    /// The same between the instants too: negative if a part of the region is crossed there.
+    pub margin_throughout: f64,
     /// The closest moment to the target's centre of mass, between instants too; `least` is in
     /// square metres. Infinitely far for a flight without states.
     pub closest: Closest,
@@ -84,7 +95,9 @@ pub struct Abort {
 /// face is branched on. A node of the search has chosen faces for some instants; its linear
 /// program asks for thrusts that go beyond all of them with the largest common margin. A negative
 /// upper bound closes the node; thrusts that also clear every other instant are the answer; else
-/// an instant that they do not clear is branched on, the one with the fewest faces in reach.
+/// an instant that they do not clear is branched on, the one with the fewest faces in reach. If
+/// the flight between instants counts, so are both ends of a segment that cuts a corner: beyond the
+/// same face at both it does not.
 ///
 /// # Errors
 /// The [`Interruption`] of the budget, asked at every node.
@@ -108,6 +121,7 @@ struct Search<'a> {
     question: &'a AbortQuestion<'a>,
     x: RelativeVector,
     working: Vec<usize>,
+    outside: Outside,
     /// Scale of each face: margins are in parts of it.
     scales: Vec<f64>,
 }
@@ -130,12 +144,13 @@ struct Node {
 impl<'a> Search<'a> {
     fn new(question: &'a AbortQuestion<'a>, x: &RelativeVector) -> Self {
         let count = question.full_forces_n.len().min(32);
-        let scale = |l: &f64| if *l != 0.0 { l.abs() } else { 1.0 };
+        let outside = Outside::new(question.avoid, question.clearances);
         Self {
             question,
             x: *x,
             working: (0..count).filter(|j| question.working >> j & 1 == 1).collect(),
-            scales: question.avoid.offsets().iter().map(scale).collect(),
+            scales: outside.scales().collect(),
+            outside,
         }
     }
 
@@ -263,8 +278,7 @@ impl<'a> Search<'a> {
             back(&mut normal, at, plant.step(question.start + at));
         }
         let drifted: f64 = (0..6).map(|c| normal[c] * self.x[c]).sum();
-        let limit = question.avoid.offsets()[face] + question.clearances[face];
-        let offset = (limit - drifted) / scale;
+        let offset = (self.outside.limit(face) - drifted) / scale;
         let most = gains.iter().map(|g| g.max(0.0)).sum::<f64>() - offset;
         FaceRow { gains, offset, most }
     }
@@ -285,34 +299,44 @@ impl<'a> Search<'a> {
         Flight::under(self.question.plant, self.question.start, &self.x, &forces)
     }
 
-    /// Largest excess beyond a face, in parts of its scale.
-    fn excess(&self, x: &RelativeVector) -> f64 {
-        let avoid = self.question.avoid;
-        (0..self.scales.len())
-            .map(|r| {
-                let product: f64 = (0..6).map(|c| avoid.normals()[(r, c)] * x[c]).sum();
-                (product - avoid.offsets()[r] - self.question.clearances[r]) / self.scales[r]
-            })
-            .fold(f64::NEG_INFINITY, f64::max)
-    }
-
-    /// The instants at which the flight is not outside.
+    /// The instants at which the flight is not outside, and those beside such a moment.
     fn inside(&self, flight: &Flight) -> Vec<usize> {
         let states = flight.states();
-        (0..states.len()).filter(|&t| !(self.excess(&states[t]) >= 0.0)).collect()
+        let mut inside: Vec<bool> =
+            states.iter().map(|x| !(self.outside.excess(x) >= 0.0)).collect();
+        if self.question.throughout {
+            for i in 1..states.len() {
+                let (from, to) = (&states[i - 1], &states[i]);
+                if !(self.outside.between(from, to, flight.spacing_s(), 0.0) >= 0.0) {
+                    inside[i - 1] = true;
+                    inside[i] = true;
+                }
+            }
+        }
+        (0..states.len()).filter(|&t| inside[t]).collect()
     }
 
     fn abort(&self, throttles: &[f64], flight: Flight, programs: usize) -> Abort {
         let m = self.working.len();
-        let mut all = vec![vec![0.0; self.question.full_forces_n.len()]; self.question.horizon];
+        let last = throttles.iter().rposition(|&throttle| throttle > 0.0);
+        let steps = last.map_or(0, |last| last / m + 1);
+        let mut all = vec![vec![0.0; self.question.full_forces_n.len()]; steps];
         for (step, row) in all.iter_mut().enumerate() {
             for (i, &j) in self.working.iter().enumerate() {
                 row[j] = throttles[step * m + i];
             }
         }
-        let margin = flight.states().iter().map(|x| self.excess(x)).fold(f64::INFINITY, f64::min);
-        let closest = flight.closest_to_target();
-        let forces_n = self.forces(throttles);
-        Abort { throttles: all, forces_n, flight, margin, closest, programs }
+        let mut forces_n = self.forces(throttles);
+        forces_n.truncate(steps);
+        Abort {
+            throttles: all,
+            forces_n,
+            horizon: self.question.horizon,
+            margin: self.outside.at_instants(&flight),
+            margin_throughout: self.outside.throughout(&flight),
+            closest: flight.closest_to_target(),
+            flight,
+            programs,
+        }
     }
 }

@@ -97,6 +97,12 @@ impl Dominance {
         self.front.insert(0, Front { row, inverse_square: 1.0 / square });
     }
 
+    /// Largest r y in the box.
+    pub(super) fn reach(&self, rest: &[f64]) -> f64 {
+        let sides = self.middle.iter().zip(&self.half);
+        rest.iter().zip(sides).map(|(r, (middle, half))| r * middle + r.abs() * half).sum()
+    }
+
     /// If `row` lies behind one of the rows in front, everywhere in the box, but for a share of at
     /// most `tolerance`: that share, at least 0.
     pub(super) fn excess(&mut self, rows: &DenseRows, row: usize, tolerance: f64) -> Option<f64> {

@@ -5,6 +5,7 @@ use std::ops::Range;
 use nalgebra::{DMatrix, SMatrix};
 
 use crate::{
+    budget::{Budget, Interruption},
     bytes::{DecodeError, Reader, Writer},
     dynamics::{PeriodicPlant, RelativeVector, TransitionMatrix},
     matrices::product_fixed,
@@ -53,15 +54,18 @@ pub struct NearEllipsoid {
 impl EllipsoidUnion {
     /// The sets of the starts `starts` for a safety horizon of `horizon` steps.
     ///
+    /// # Errors
+    /// The [`Interruption`] of the budget, asked for every start.
+    ///
     /// # Panics
     /// If the ellipsoid is not six-dimensional.
-    #[must_use]
     pub fn new(
         plant: &PeriodicPlant,
         set: &CentredEllipsoid,
         horizon: usize,
         starts: Range<usize>,
-    ) -> Self {
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
         assert_eq!(set.precision().nrows(), 6, "an ellipsoid of relative states");
         let precision = TransitionMatrix::from_fn(|i, j| set.precision()[(i, j)]);
         let mixes = PLANE.iter().any(|&i| ACROSS.iter().any(|&j| precision[(i, j)] != 0.0));
@@ -70,6 +74,7 @@ impl EllipsoidUnion {
         let terms = if mixes { COUPLED } else { DECOUPLED };
         let mut coefficients = vec![0.0; starts.len() * terms * instants];
         for (block, k) in coefficients.chunks_exact_mut(terms * instants).zip(starts.clone()) {
+            budget.check()?;
             let mut phi = TransitionMatrix::identity();
             for t in 0..instants {
                 let (step, part) = (t / parts, t % parts);
@@ -84,7 +89,7 @@ impl EllipsoidUnion {
                 }
             }
         }
-        Self { first: starts.start, starts: starts.len(), instants, terms, coefficients }
+        Ok(Self { first: starts.start, starts: starts.len(), instants, terms, coefficients })
     }
 
     /// Puts ranges of starts that follow each other together; `None` if they do not.
@@ -321,7 +326,7 @@ mod tests {
     fn gauge_of_a_set_is_the_gauge_where_the_drift_ends() {
         let plant = plant(3);
         let set = approach_ellipsoid();
-        let union = EllipsoidUnion::new(&plant, &set, 40, 200..215);
+        let union = EllipsoidUnion::new(&plant, &set, 40, 200..215, Budget::UNLIMITED).unwrap();
         for (k, instant) in [(200, 0), (205, 3 * 17), (211, 3 * 40), (214, 3 * 9 + 2)] {
             let (step, part) = (instant / 3, instant % 3);
             let mut end = product_fixed(&plant.transition(k, step), &state());
@@ -343,7 +348,7 @@ mod tests {
         precision[(0, 2)] = 0.3e-6;
         precision[(2, 0)] = 0.3e-6;
         let tilted = CentredEllipsoid::from_precision(precision).unwrap();
-        let union = EllipsoidUnion::new(&plant, &tilted, 10, 0..2);
+        let union = EllipsoidUnion::new(&plant, &tilted, 10, 0..2, Budget::UNLIMITED).unwrap();
         let end = product_fixed(&plant.transition(1, 7), &state());
         let end = nalgebra::DVector::from_column_slice(end.as_slice());
         let mut gauges = Vec::new();
@@ -353,7 +358,9 @@ mod tests {
 
     #[test]
     fn nearest_are_the_least_of_all() {
-        let union = EllipsoidUnion::new(&plant(1), &approach_ellipsoid(), 300, 0..4);
+        let union =
+            EllipsoidUnion::new(&plant(1), &approach_ellipsoid(), 300, 0..4, Budget::UNLIMITED)
+                .unwrap();
         let near = union.nearest(2, &state(), 3);
         let mut gauges = Vec::new();
         union.gauges_squared(2, &state(), &mut gauges);
@@ -370,8 +377,9 @@ mod tests {
     #[test]
     fn shards_join_to_the_whole() {
         let (plant, set) = (plant(1), approach_ellipsoid());
-        let whole = EllipsoidUnion::new(&plant, &set, 20, 0..9);
-        let part = |starts| EllipsoidUnion::new(&plant, &set, 20, starts);
+        let whole = EllipsoidUnion::new(&plant, &set, 20, 0..9, Budget::UNLIMITED).unwrap();
+        let part =
+            |starts| EllipsoidUnion::new(&plant, &set, 20, starts, Budget::UNLIMITED).unwrap();
         assert_eq!(EllipsoidUnion::joined(vec![part(0..4), part(4..9)]), Some(whole));
         assert_eq!(EllipsoidUnion::joined(vec![part(0..4), part(5..9)]), None);
         assert_eq!(EllipsoidUnion::joined(Vec::new()), None);

@@ -89,56 +89,109 @@ impl Flight {
         self.closest(&Matrix3::identity()).unwrap_or(never)
     }
 
-    /// The least p'Wp over the whole flight, W (3 x 3) positive definite.
+    /// The least p'Wp over the whole flight, W (3 x 3) positive definite; `None` without states.
     ///
     /// Between samples the position is the cubic through their positions and velocities. Its error
     /// is about (n dt)^4 / 384 of the distance for a mean motion n: 4e-9 for 30 s in low orbit.
     #[must_use]
     pub fn closest(&self, weight: &Matrix3<f64>) -> Option<Closest> {
-        let form = |p: &Vector3<f64>| p.dot(&(weight * p));
-        let at = |i: usize| self.states[i].fixed_rows::<3>(0).into_owned();
-        let first = self.states.first().map(|_| Closest { least: form(&at(0)), at_s: 0.0 })?;
-        let sampled = (1..self.states.len()).fold(first, |best, i| {
-            let least = form(&at(i));
-            if least < best.least {
-                Closest { least, at_s: i as f64 * self.spacing_s }
-            } else {
-                best
+        let (instant, least) = self.least_at_instants(weight)?;
+        let mut closest = Closest { least, at_s: instant as f64 * self.spacing_s };
+        for (i, pair) in self.states.windows(2).enumerate() {
+            let segment = Segment::between(&pair[0], &pair[1], self.spacing_s);
+            if segment.stays_beyond(weight, closest.least) {
+                continue;
             }
-        });
-        Some((1..self.states.len()).fold(sampled, |best, i| {
-            let within = Segment::between(&self.states[i - 1], &self.states[i], self.spacing_s);
-            // No point of a cubic leaves the hull of its control points, so its gauge is at least
-            // the ends' less the polygon's length.
-            let gauge = |p: &Vector3<f64>| form(p).sqrt();
-            let polygon: f64 = within.control.windows(2).map(|c| gauge(&(c[1] - c[0]))).sum();
-            let ends = gauge(&within.control[0]).min(gauge(&within.control[3]));
-            if ends - polygon >= best.least.sqrt() {
-                return best;
+            let (least, share) = segment.least(|share| form(weight, &segment.position(share)));
+            if least < closest.least {
+                closest = Closest { least, at_s: (i as f64 + share) * self.spacing_s };
             }
-            let (least, share) = within.least(&form);
-            if least < best.least {
-                Closest { least, at_s: (i as f64 - 1.0 + share) * self.spacing_s }
-            } else {
-                best
-            }
-        }))
+        }
+        Some(closest)
     }
+
+    /// The first instant of the least p'Wp at the instants, with it; `None` without states.
+    #[must_use]
+    pub fn least_at_instants(&self, weight: &Matrix3<f64>) -> Option<(usize, f64)> {
+        let values = self.states.iter().map(|x| form(weight, &position(x)));
+        values.enumerate().reduce(|best, other| if other.1 < best.1 { other } else { best })
+    }
+
+    /// Seconds until p'Wp is at most 1 for the first time, between instants too.
+    #[must_use]
+    pub fn first_within(&self, weight: &Matrix3<f64>) -> Option<f64> {
+        if self.states.first().is_some_and(|x| form(weight, &position(x)) <= 1.0) {
+            return Some(0.0);
+        }
+        self.states.windows(2).enumerate().find_map(|(i, pair)| {
+            let segment = Segment::between(&pair[0], &pair[1], self.spacing_s);
+            if segment.stays_beyond(weight, 1.0) {
+                return None;
+            }
+            let value = |share: f64| form(weight, &segment.position(share));
+            let (least, share) = segment.least(value);
+            (least <= 1.0).then(|| {
+                // Outside where the segment begins, inside at its least: halved to rounding.
+                let (mut outside, mut inside) = (0.0, share);
+                for _ in 0..50 {
+                    let middle = 0.5 * (outside + inside);
+                    *(if value(middle) <= 1.0 { &mut inside } else { &mut outside }) = middle;
+                }
+                (i as f64 + inside) * self.spacing_s
+            })
+        })
+    }
+}
+
+fn position(x: &RelativeVector) -> Vector3<f64> {
+    x.fixed_rows::<3>(0).into_owned()
+}
+
+/// p'Wp.
+fn form(weight: &Matrix3<f64>, p: &Vector3<f64>) -> f64 {
+    p.dot(&(weight * p))
 }
 
 /// A cubic by its control points.
-struct Segment {
-    control: [Vector3<f64>; 4],
+pub(super) struct Segment {
+    pub(super) control: [Vector3<f64>; 4],
+    spacing_s: f64,
 }
 
 impl Segment {
-    fn between(from: &RelativeVector, to: &RelativeVector, spacing_s: f64) -> Self {
-        let p = |x: &RelativeVector| x.fixed_rows::<3>(0).into_owned();
-        let v = |x: &RelativeVector| x.fixed_rows::<3>(3) * (spacing_s / 3.0);
-        Self { control: [p(from), p(from) + v(from), p(to) - v(to), p(to)] }
+    pub(super) fn between(from: &RelativeVector, to: &RelativeVector, spacing_s: f64) -> Self {
+        let (p, q) = (position(from), position(to));
+        let way = |x: &RelativeVector| x.fixed_rows::<3>(3) * (spacing_s / 3.0);
+        Self { control: [p, p + way(from), q - way(to), q], spacing_s }
     }
 
-    fn at(&self, share: f64) -> Vector3<f64> {
+    /// Proves, if it can, that p'Wp stays at or above `least`: no point of a cubic leaves the hull
+    /// of its control points, so its gauge is at least the ends' less the polygon's length.
+    fn stays_beyond(&self, weight: &Matrix3<f64>, least: f64) -> bool {
+        let [a, b, c, d] = &self.control;
+        let ends = form(weight, a).min(form(weight, d));
+        let sides = [b - a, c - b, d - c].map(|side| form(weight, &side));
+        // Roots are dear: (a + b)^2 <= 2 a^2 + 2 b^2 settles what is far away.
+        if ends >= 2.0 * least + 6.0 * (sides[0] + sides[1] + sides[2]) {
+            return true;
+        }
+        let polygon: f64 = sides.iter().map(|side| side.sqrt()).sum();
+        ends.sqrt() - polygon >= least.sqrt()
+    }
+
+    /// Control points of the velocity, which is a parabola.
+    pub(super) fn velocity_control(&self) -> [Vector3<f64>; 3] {
+        let rate = 3.0 / self.spacing_s;
+        std::array::from_fn(|i| (self.control[i + 1] - self.control[i]) * rate)
+    }
+
+    pub(super) fn velocity(&self, share: f64) -> Vector3<f64> {
+        let [a, b, c] = self.velocity_control();
+        let rest = 1.0 - share;
+        a * (rest * rest) + b * (2.0 * rest * share) + c * (share * share)
+    }
+
+    pub(super) fn position(&self, share: f64) -> Vector3<f64> {
         let [a, b, c, d] = &self.control;
         let rest = 1.0 - share;
         a * (rest * rest * rest)
@@ -147,10 +200,9 @@ impl Segment {
             + d * (share * share * share)
     }
 
-    /// Least value of `form`, and where: a scan, then golden sections around its best.
-    fn least(&self, form: &impl Fn(&Vector3<f64>) -> f64) -> (f64, f64) {
+    /// Least of `value` over the segment, and where: a scan, then golden sections around its best.
+    pub(super) fn least(&self, value: impl Fn(f64) -> f64) -> (f64, f64) {
         const SCAN: usize = 16;
-        let value = |share: f64| form(&self.at(share));
         let best = (0..=SCAN)
             .map(|i| i as f64 / SCAN as f64)
             .min_by(|a, b| value(*a).total_cmp(&value(*b)))

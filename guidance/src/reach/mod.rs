@@ -2,6 +2,7 @@
 //! law keeps them, and the few rows of many that say so.
 
 mod abort;
+mod clearance;
 mod dominance;
 mod elimination;
 mod ellipsoids;
@@ -19,6 +20,7 @@ mod separation;
 mod tube;
 
 pub use abort::{Abort, AbortQuestion, AbortVerdict, find_abort};
+pub use clearance::Outside;
 pub use elimination::{EliminationError, project_out_last};
 pub use ellipsoids::{EllipsoidUnion, NearEllipsoid};
 pub use extremes::{ExtremeCheck, check_extremes};
@@ -29,10 +31,13 @@ pub use invariant::{
     Invariant, InvariantLimits, PlantVertex, max_robust_control_invariant,
     max_robust_positive_invariant, step_back,
 };
-pub use passive::{PassiveQuestion, PassiveVerdict, passive_safety};
+pub(crate) use passive::passive_safety_along;
+pub use passive::{DriftVerdict, PassiveQuestion, PassiveVerdict, passive_safety};
 pub use polytopes::{PolytopeQuestion, PolytopeUnion, ReachablePolytope};
 pub use redundancy::{EXACT, Reduction, irredundant, irredundant_about};
 pub use sampled_constraints::{StageConstraints, StageFamily, StageGroup};
 pub use scenario::{Context, GroupPart, SampledRows, Scenario, Survivors};
-pub use separation::{Cut, cut_off_ellipsoid, cut_off_polytope};
+pub use separation::{
+    Cut, cut_off_ellipsoid, cut_off_ellipsoids, cut_off_polytope, cut_off_polytopes,
+};
 pub use tube::{Decrease, Tube, TubeError};

@@ -1,10 +1,11 @@
 //! Does a craft that loses all thrust drift into an ellipsoid? Linear and nonlinear.
 
-use nalgebra::{DVector, Matrix3};
+use nalgebra::Matrix3;
 
 use super::flight::{Closest, Flight};
 use crate::{
-    dynamics::{PeriodicPlant, RelativeVector, TwoBodyDrift},
+    dynamics::{PeriodicPlant, RelativeVector, TransitionMatrix, TwoBodyDrift},
+    matrices::product_fixed,
     orbit::{KeplerOrbit, OrbitError},
     sets::CentredEllipsoid,
     units::Seconds,
@@ -49,6 +50,8 @@ pub struct DriftVerdict {
     /// Least distance from the target's centre of mass between instants too; `least` is in square
     /// metres.
     pub closest_distance: Closest,
+    /// Seconds until the position is in the region for the first time, between instants too.
+    pub entered_s: Option<f64>,
 }
 
 impl DriftVerdict {
@@ -80,30 +83,31 @@ pub fn passive_safety(
     k: usize,
     x: &RelativeVector,
 ) -> Result<PassiveVerdict, OrbitError> {
-    let linear = Flight::drifting(question.plant, k, x, question.horizon);
+    passive_safety_along(question, k, &Flight::drifting(question.plant, k, x, question.horizon))
+}
+
+/// The same of a drift that the linear plant has flown already.
+pub(crate) fn passive_safety_along(
+    question: &PassiveQuestion<'_>,
+    k: usize,
+    linear: &Flight,
+) -> Result<PassiveVerdict, OrbitError> {
+    let x = linear.states().first().ok_or(OrbitError::Rectilinear)?;
     let start_s = k as f64 * question.plant.sample_time().seconds();
     let drift = TwoBodyDrift::new(question.orbit, Seconds::from_seconds(start_s), x)?;
-    let spacing_s = linear.spacing_s();
-    let states: Option<Vec<RelativeVector>> = (0..linear.states().len())
-        .map(|i| drift.after(Seconds::from_seconds(i as f64 * spacing_s)))
-        .collect();
-    let two_body = Flight::from_states(spacing_s, states.ok_or(OrbitError::Rectilinear)?);
+    let spacing = Seconds::from_seconds(linear.spacing_s());
+    let states = drift.every(spacing, linear.states().len()).ok_or(OrbitError::Rectilinear)?;
+    let two_body = Flight::from_states(linear.spacing_s(), states);
     let judge = |flight: &Flight| judge(flight, question.avoid).ok_or(OrbitError::Rectilinear);
-    Ok(PassiveVerdict { linear: judge(&linear)?, two_body: judge(&two_body)? })
+    Ok(PassiveVerdict { linear: judge(linear)?, two_body: judge(&two_body)? })
 }
 
 /// `None` for a flight without states.
 fn judge(flight: &Flight, avoid: &CentredEllipsoid) -> Option<DriftVerdict> {
     let weight = Matrix3::from_fn(|i, j| avoid.precision()[(i, j)]);
-    let positions = flight.states().iter().map(|x| {
-        let p = x.fixed_rows::<3>(0);
-        p.dot(&(weight * p))
-    });
-    let states = flight
-        .states()
-        .iter()
-        .map(|x| avoid.gauge_squared(&DVector::from_column_slice(x.as_slice())));
-    let (position_instant, least_position_gauge_squared) = first_least(positions)?;
+    let precision = TransitionMatrix::from_fn(|i, j| avoid.precision()[(i, j)]);
+    let (position_instant, least_position_gauge_squared) = flight.least_at_instants(&weight)?;
+    let states = flight.states().iter().map(|x| x.dot(&product_fixed(&precision, x)));
     let (state_instant, least_state_gauge_squared) = first_least(states)?;
     Some(DriftVerdict {
         least_position_gauge_squared,
@@ -112,6 +116,7 @@ fn judge(flight: &Flight, avoid: &CentredEllipsoid) -> Option<DriftVerdict> {
         state_instant,
         closest_gauge: flight.closest(&weight)?,
         closest_distance: flight.closest(&Matrix3::identity())?,
+        entered_s: flight.first_within(&weight),
     })
 }
 
@@ -139,6 +144,8 @@ mod tests {
             assert!(drift.safe_at_instants() && !drift.safe_throughout());
             assert!((drift.closest_gauge.at_s - 45.0).abs() < 1.0, "{drift:?}");
             assert!(drift.closest_distance.least.sqrt() < 50.0, "{drift:?}");
+            // 100 m away after 40 s; the drift bends a little.
+            assert!((drift.entered_s.unwrap() - 40.0).abs() < 1.0, "{drift:?}");
         }
         // Sampled three times as often it is seen at an instant.
         let finer = PeriodicPlant::new(&orbit, mass, step, 212, 4);

@@ -5,6 +5,7 @@ use std::ops::Range;
 use nalgebra::{DMatrix, DVector, SMatrix, Vector3};
 
 use crate::{
+    budget::{Budget, Interruption},
     bytes::{DecodeError, Reader, Writer},
     dynamics::{HeldStep, PeriodicPlant, RelativeVector},
     matrices::product_fixed,
@@ -74,19 +75,44 @@ pub struct PolytopeQuestion<'a> {
 impl PolytopeUnion {
     /// The sets of the starts `starts`.
     ///
+    /// # Errors
+    /// The [`Interruption`] of the budget, asked for every instant at which sets end.
+    ///
     /// # Panics
     /// If the polytope is not six-dimensional.
-    #[must_use]
-    pub fn new(question: &PolytopeQuestion<'_>, starts: Range<usize>) -> Self {
-        let avoid = question.avoid;
-        assert_eq!(avoid.normals().ncols(), 6, "a polytope of relative states");
-        let emptiness = Emptiness::of(avoid);
-        Self {
+    pub fn new(
+        question: &PolytopeQuestion<'_>,
+        starts: Range<usize>,
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
+        let mut union = Self {
             first: starts.start,
-            rows: avoid.offsets().len(),
+            rows: question.avoid.offsets().len(),
             modes: question.modes.len(),
-            starts: starts.map(|k| sets_of_start(question, &emptiness, k)).collect(),
-        }
+            starts: vec![StartSets::default(); starts.len()],
+        };
+        let first = starts.start;
+        visit_sets(question, starts, budget, |start, instant, chain| {
+            union.starts[start - first].add(instant, chain);
+        })?;
+        Ok(union)
+    }
+
+    /// How many sets [`Self::new`] would hold, without holding them.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    ///
+    /// # Panics
+    /// As [`Self::new`].
+    pub fn count(
+        question: &PolytopeQuestion<'_>,
+        starts: Range<usize>,
+        budget: Budget<'_>,
+    ) -> Result<usize, Interruption> {
+        let mut count = 0;
+        visit_sets(question, starts, budget, |_, _, chain| count += chain.sets())?;
+        Ok(count)
     }
 
     /// Puts ranges of starts that follow each other together; `None` if they do not.
@@ -202,17 +228,36 @@ impl PolytopeUnion {
         x: &RelativeVector,
         count: usize,
     ) -> Vec<(f64, ReachablePolytope<'_>)> {
-        let mut near: Vec<(f64, ReachablePolytope<'_>)> = Vec::with_capacity(count + 1);
-        for set in self.sets(k) {
-            let nearness = set.nearness(x);
-            if near.len() < count || near.last().is_some_and(|last| nearness < last.0) {
-                let place = near.partition_point(|other| other.0 <= nearness);
-                near.insert(place, (nearness, set));
-                near.truncate(count);
-            }
-        }
-        near
+        nearest_of(self.sets(k), x, count)
     }
+
+    /// The same over the starts of the whole period: the union (12) taken literally.
+    #[must_use]
+    pub fn nearest_untimed(
+        &self,
+        x: &RelativeVector,
+        count: usize,
+    ) -> Vec<(f64, ReachablePolytope<'_>)> {
+        let starts = self.first..self.first + self.starts.len();
+        nearest_of(starts.flat_map(|k| self.sets(k)), x, count)
+    }
+}
+
+fn nearest_of<'a>(
+    sets: impl Iterator<Item = ReachablePolytope<'a>>,
+    x: &RelativeVector,
+    count: usize,
+) -> Vec<(f64, ReachablePolytope<'a>)> {
+    let mut near: Vec<(f64, ReachablePolytope<'a>)> = Vec::with_capacity(count + 1);
+    for set in sets {
+        let nearness = set.nearness(x);
+        if near.len() < count || near.last().is_some_and(|last| nearness < last.0) {
+            let place = near.partition_point(|other| other.0 <= nearness);
+            near.insert(place, (nearness, set));
+            near.truncate(count);
+        }
+    }
+    near
 }
 
 impl ReachablePolytope<'_> {
@@ -286,24 +331,61 @@ impl Emptiness {
     }
 }
 
-fn sets_of_start(question: &PolytopeQuestion<'_>, emptiness: &Emptiness, k: usize) -> StartSets {
-    let mut found = StartSets::default();
-    let parts = question.plant.fraction_count();
-    for instant in 0..=question.horizon * parts {
-        let Some(chain) = Chain::back_from(question, emptiness, k, instant) else { continue };
-        found.normals.extend(chain.normals.iter().flat_map(|row| row.iter().copied()));
-        for (mode, offsets) in chain.offsets.into_iter().enumerate() {
+impl StartSets {
+    fn add(&mut self, instant: usize, chain: &Chain) {
+        self.normals.extend(chain.normals.iter().flat_map(|row| row.iter().copied()));
+        for (mode, offsets) in chain.offsets.iter().enumerate() {
             if let Some(offsets) = offsets {
-                found.sets.push((found.kept.len(), mode));
-                found.offsets.extend(offsets);
+                self.sets.push((self.kept.len(), mode));
+                self.offsets.extend(offsets);
             }
         }
-        found.kept.push(instant);
+        self.kept.push(instant);
     }
-    found
 }
 
-/// The sets of all modes for one final instant, taken back step by step.
+/// Every start and instant after it at which some mode's set is not empty; for each start, instants
+/// ascend.
+///
+/// The sets that end at one moment are one chain back through the starts before it, so a chain is
+/// walked once for all of them.
+fn visit_sets(
+    question: &PolytopeQuestion<'_>,
+    starts: Range<usize>,
+    budget: Budget<'_>,
+    mut visit: impl FnMut(usize, usize, &Chain),
+) -> Result<(), Interruption> {
+    assert_eq!(question.avoid.normals().ncols(), 6, "a polytope of relative states");
+    let emptiness = Emptiness::of(question.avoid);
+    let (parts, horizon) = (question.plant.fraction_count(), question.horizon);
+    if starts.is_empty() {
+        return Ok(());
+    }
+    for end in starts.start..starts.end + horizon {
+        for part in 0..parts {
+            budget.check()?;
+            let mut chain = Chain::new(question);
+            if part > 0 {
+                chain.back(question, &emptiness, question.plant.fraction(end, part));
+            }
+            for start in (starts.start.max(end.saturating_sub(horizon))..=end).rev() {
+                if start < end {
+                    chain.back(question, &emptiness, question.plant.step(start));
+                }
+                if chain.sets() == 0 {
+                    break;
+                }
+                let instant = (end - start) * parts + part;
+                if start < starts.end && instant <= horizon * parts {
+                    visit(start, instant, &chain);
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The sets of all modes that end at one moment, taken back step by step.
 struct Chain {
     normals: Vec<SMatrix<f64, 1, 6>>,
     /// `None` once empty: then empty for ever.
@@ -311,34 +393,19 @@ struct Chain {
 }
 
 impl Chain {
-    /// From `instant` back to start k; `None` if every mode's set is empty.
-    fn back_from(
-        question: &PolytopeQuestion<'_>,
-        emptiness: &Emptiness,
-        k: usize,
-        instant: usize,
-    ) -> Option<Self> {
-        let (plant, avoid) = (question.plant, question.avoid);
-        let (steps, part) = (instant / plant.fraction_count(), instant % plant.fraction_count());
+    fn new(question: &PolytopeQuestion<'_>) -> Self {
+        let avoid = question.avoid;
+        let normal = |row: usize| avoid.normals().fixed_view::<1, 6>(row, 0).into_owned();
         let offsets = avoid.offsets().as_slice().to_vec();
-        let mut chain = Self {
-            normals: avoid
-                .normals()
-                .row_iter()
-                .map(|row| row.fixed_columns::<6>(0).into_owned())
-                .collect(),
+        Self {
+            normals: (0..offsets.len()).map(normal).collect(),
             offsets: vec![Some(offsets); question.modes.len()],
-        };
-        if part > 0 {
-            chain.back(question, emptiness, plant.fraction(k + steps, part));
         }
-        for j in (0..steps).rev() {
-            if chain.offsets.iter().all(Option::is_none) {
-                return None;
-            }
-            chain.back(question, emptiness, plant.step(k + j));
-        }
-        chain.offsets.iter().any(Option::is_some).then_some(chain)
+    }
+
+    /// Modes whose set is not empty.
+    fn sets(&self) -> usize {
+        self.offsets.iter().flatten().count()
     }
 
     /// One step of (20): H <- H A, l <- min over u of l - H B u, which takes each working

@@ -156,6 +156,44 @@ struct Search {
     reversed: Vec<f64>,
 }
 
+/// Every row times the matrix: M a_i.
+fn mapped(rows: &DenseRows, matrix: &DMatrix<f64>) -> DenseRows {
+    let by_rows = DenseRows::from_matrix(matrix);
+    let mut image = DenseRows::new(matrix.nrows());
+    let mut normal = Vec::with_capacity(matrix.nrows());
+    for row in 0..rows.len() {
+        by_rows.products(rows.normal(row), &mut normal);
+        image.push(&normal);
+    }
+    image
+}
+
+/// Orthonormal axes, one a row, along which rows differ from the multiple of the row before that
+/// is nearest to them.
+fn axes_of_differences(rows: &DenseRows, candidates: usize) -> DMatrix<f64> {
+    let n = rows.columns();
+    let mut spread = DMatrix::<f64>::zeros(n, n);
+    let mut rest = vec![0.0; n];
+    for row in 1..candidates {
+        let (before, this) = (rows.normal(row - 1), rows.normal(row));
+        let square: f64 = before.iter().map(|a| a * a).sum();
+        let along: f64 = before.iter().zip(this).map(|(a, b)| a * b).sum();
+        // The first row of another bundle says nothing about differences within one.
+        if !(along * along > 0.5 * square * this.iter().map(|a| a * a).sum::<f64>()) {
+            continue;
+        }
+        let pairs = this.iter().zip(before);
+        rest.iter_mut().zip(pairs).for_each(|(r, (a, b))| *r = a - along / square * b);
+        for i in 0..n {
+            for j in 0..n {
+                spread[(i, j)] += rest[i] * rest[j];
+            }
+        }
+    }
+    let axes = spread.symmetric_eigen().eigenvectors.transpose();
+    if axes.iter().all(|x| x.is_finite()) { axes } else { DMatrix::identity(n, n) }
+}
+
 /// How a feasibility program ended.
 enum Outcome {
     Redundant,
@@ -193,14 +231,11 @@ impl Search {
         let floor = 1e-9 * moments.trace().max(f64::MIN_POSITIVE) / n as f64;
         let metric = QuadraticCost::new(moments + DMatrix::identity(n, n) * floor)
             .map_err(|_| NoInterior::Numerical)?;
-        let mut round = DenseRows::new(n);
-        for row in 0..polar.len() {
-            let a = polar.normal(row);
-            for (k, component) in normal.iter_mut().enumerate() {
-                *component = metric.factor_column(k).iter().zip(a).map(|(j, a)| j * a).sum();
-            }
-            round.push(&normal);
-        }
+        let whiten = DMatrix::from_fn(n, n, |k, i| metric.factor_column(k)[i]);
+        let round = mapped(&polar, &whiten);
+        // Turned so that neighbours differ along few axes: then a box along the axes is tight for
+        // what they differ by.
+        let round = mapped(&round, &axes_of_differences(&round, candidates));
         Ok(Self {
             fate: vec![Fate::Open; candidates],
             needed: (candidates..all.len()).collect(),
@@ -287,8 +322,36 @@ impl Search {
             if !self.active.point().iter().all(|y| y.is_finite()) {
                 return Outcome::Doubtful;
             }
+            if let Some(excess) = self.proved_by_the_box(row) {
+                self.outer_excess = self.outer_excess.max(excess);
+                return Outcome::Redundant;
+            }
         }
         Outcome::Open
+    }
+
+    /// Before the search ends: the active rows combine to nearly a_row, and what is missing is
+    /// bounded by the box. The point itself says what is missing, times the row's own weight; what
+    /// counts is computed again from the rows.
+    fn proved_by_the_box(&self, row: usize) -> Option<f64> {
+        let dominance = self.dominance.as_ref()?;
+        let (mut own, mut sum) = (0.0, 0.0);
+        for (other, weight) in self.active.active() {
+            if other == row { own = weight } else { sum += weight }
+        }
+        let enough = |reach: f64| own > 0.0 && sum / own + reach <= 1.0 + self.tolerance;
+        if !enough(dominance.reach(self.active.point()) / own) {
+            return None;
+        }
+        let mut rest = self.polar.normal(row).to_vec();
+        for (other, weight) in self.active.active().filter(|&(other, _)| other != row) {
+            let share = weight.max(0.0) / own;
+            for (r, a) in rest.iter_mut().zip(self.polar.normal(other)) {
+                *r -= share * a;
+            }
+        }
+        let reach = dominance.reach(&rest);
+        enough(reach).then(|| (sum / own + reach - 1.0).max(0.0))
     }
 
     /// The most violated row, among recent ones if there is any, else among all needed ones.

@@ -16,8 +16,10 @@ use crate::{
     sampling::{ScalarLaw, Stream},
 };
 
-/// Samples of every group that make the context.
-const CONTEXT_SAMPLES: usize = 24;
+/// Samples of every group that the context is chosen from.
+const CONTEXT_SAMPLES: usize = 12;
+/// Rows that cut off less than this are not chosen: any choice would do, and a small one is fast.
+const CONTEXT_TOLERANCE: f64 = 0.05;
 /// Samples between two looks at the budget.
 const BUDGET_PERIOD: usize = 64;
 /// Share of the terminal set's inner point in the point that rows are measured about: whatever is
@@ -93,7 +95,7 @@ impl GroupPart {
 /// What stays in every reduction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Context {
-    /// The needed rows among the first few samples of every group.
+    /// Some rows of the first few samples of every group.
     pub rows: SampledRows,
     /// The point that rows are measured about.
     pub centre: InteriorPoint,
@@ -204,8 +206,8 @@ impl Scenario<'_> {
         self.constraints.of(family).len() * if certain { 1 } else { self.sizes[group] }
     }
 
-    /// The needed rows among the first few samples of every group. They stay in every reduction,
-    /// so that a part sees what the others do to the set.
+    /// The rows that matter most among the first few samples of every group. They stay in every
+    /// part's reduction, so that it sees what the others do to the set.
     ///
     /// # Errors
     /// [`NoInterior`]: the sampled set is empty or flat already.
@@ -218,7 +220,7 @@ impl Scenario<'_> {
             let rows = self.rows(GroupPart::whole(group), first, budget)?;
             all.extend(&rows, std::iter::repeat_n(group, rows.len()));
         }
-        let reduction = irredundant(&all.rows, &none, EXACT, budget)?;
+        let reduction = irredundant(&all.rows, &none, CONTEXT_TOLERANCE, budget)?;
         let inside = self.constraints.terminal.interior_point(budget)?;
         let inside = inside.point.into_iter().chain(std::iter::repeat(0.0));
         let point: Vec<f64> = (reduction.interior.point.iter().zip(inside))
@@ -240,8 +242,8 @@ impl Scenario<'_> {
         tolerance: f64,
         budget: Budget<'_>,
     ) -> Result<Survivors, NoInterior> {
-        let size = self.sizes[part.group];
-        let rows = self.rows(part, CONTEXT_SAMPLES.min(size)..size, budget)?;
+        let rows = self.rows(part, 0..self.sizes[part.group], budget)?;
+        let rows = nearest_first(&rows, self.sizes[part.group], &context.centre);
         let beside = &context.rows.rows;
         let reduction = irredundant_about(&context.centre, &rows, beside, tolerance, budget)?;
         Survivors::new(&reduction, &rows, beside, |_| part.group, budget)
@@ -258,14 +260,21 @@ impl Scenario<'_> {
         tolerance: f64,
         budget: Budget<'_>,
     ) -> Result<Survivors, NoInterior> {
-        let mut all = context.rows.clone();
+        let mut all = context.rows.select(&[]);
         for part in parts {
             all.extend(&part.rows.rows, part.rows.groups.iter().copied());
         }
-        let none = HalfSpaces::new(all.rows.dimension());
-        let reduction = irredundant_about(&context.centre, &all.rows, &none, tolerance, budget)?;
-        let merged =
-            Survivors::new(&reduction, &all.rows, &none, |index| all.groups[index], budget)?;
+        let groups = |index| all.groups[index];
+        let (centre, beside) = (&context.centre, &context.rows.rows);
+        let reduction = irredundant_about(centre, &all.rows, beside, tolerance, budget)?;
+        let mut merged = Survivors::new(&reduction, &all.rows, beside, groups, budget)?;
+        // What the context was needed for is over: rows of it that are not needed go.
+        let left = &merged.rows.rows;
+        let reduction = irredundant_about(centre, beside, left, EXACT, budget.untold())?;
+        let kept = context.rows.select(&reduction.kept);
+        merged.rows.extend(&kept.rows, kept.groups);
+        merged.doubtful += reduction.doubtful;
+        merged.outer_excess = (1.0 + merged.outer_excess) * (1.0 + reduction.outer_excess) - 1.0;
         let before = parts.iter().map(|part| part.outer_excess).fold(0.0, f64::max);
         Ok(Survivors {
             // What is left of the parts holds within one factor, what they removed within both.
@@ -275,4 +284,16 @@ impl Scenario<'_> {
             ..merged
         })
     }
+}
+
+/// Bundles of `size` rows each, those nearest to the point first: later ones lie behind them.
+fn nearest_first(rows: &HalfSpaces, size: usize, about: &InteriorPoint) -> HalfSpaces {
+    let mut products = Vec::with_capacity(rows.len());
+    rows.rows().products(&about.point, &mut products);
+    let distance = |row: usize| (rows.offset(row) - products[row]) * rows.rows().scale(row);
+    let mut order: Vec<usize> = (0..rows.len()).collect();
+    for bundle in order.chunks_mut(size.max(1)) {
+        bundle.sort_by(|&a, &b| distance(a).total_cmp(&distance(b)).then(a.cmp(&b)));
+    }
+    rows.select(&order)
 }

@@ -2,10 +2,14 @@
 
 use nalgebra::DVector;
 
-use super::{EllipsoidUnion, ReachablePolytope};
+use super::{EllipsoidUnion, NearEllipsoid, ReachablePolytope};
 use crate::{
     dynamics::RelativeVector,
-    program::{HalfSpaces, nearest_point_of_polytope},
+    program::{
+        HalfSpaces, SeparationOutcome, nearest_point_of_polytope, separate_from_ellipsoids,
+        separate_from_polytopes,
+    },
+    sets::Polytope,
 };
 
 /// normal x >= offset keeps x out of a set: {y : normal y <= offset} holds the set.
@@ -31,6 +35,43 @@ pub fn cut_off_ellipsoid(
 ) -> Option<Cut> {
     let (normal, clearance) = union.tangent(start, instant, x)?;
     Some(Cut { normal, offset: 1.0, clearance })
+}
+
+/// The best half-space around several ellipsoids at once; `None` if none that holds them all leaves
+/// `x` out. [AguilarMarsillach2022, eq. 32]
+#[must_use]
+pub fn cut_off_ellipsoids(
+    union: &EllipsoidUnion,
+    sets: &[NearEllipsoid],
+    x: &RelativeVector,
+) -> Option<Cut> {
+    let precisions: Vec<_> =
+        sets.iter().map(|set| union.precision(set.start, set.instant)).collect();
+    let references: Vec<_> = precisions.iter().collect();
+    common(separate_from_ellipsoids(&references, &DVector::from_column_slice(x.as_slice())), x)
+}
+
+/// The best half-space around several polytopes at once; `None` if none that holds them all and the
+/// origin leaves `x` out. [AguilarMarsillach2022, eq. 28]
+#[must_use]
+pub fn cut_off_polytopes<'a>(
+    sets: impl Iterator<Item = &'a ReachablePolytope<'a>>,
+    x: &RelativeVector,
+) -> Option<Cut> {
+    let polytopes: Vec<Polytope> = sets.map(ReachablePolytope::polytope).collect();
+    let sides: Vec<HalfSpaces<'_>> = polytopes
+        .iter()
+        .map(|set| HalfSpaces { normals: set.normals(), offsets: set.offsets() })
+        .collect();
+    common(separate_from_polytopes(&sides, &DVector::from_column_slice(x.as_slice())), x)
+}
+
+/// What the solver found, if it leaves x out; how far is computed once more.
+fn common(outcome: SeparationOutcome, x: &RelativeVector) -> Option<Cut> {
+    let SeparationOutcome::Found(found) = outcome else { return None };
+    let normal = RelativeVector::from_column_slice(found.normal.as_slice());
+    let clearance = normal.dot(x) - 1.0;
+    (clearance >= 0.0).then_some(Cut { normal, offset: 1.0, clearance })
 }
 
 /// The best half-space around one polytope, in closed form.

@@ -4,10 +4,11 @@ use nalgebra::{Matrix3, SMatrix, Vector3};
 use vbar_guidance::{
     Budget,
     control::{
-        Controller, PrepareError, StepError,
+        ConstraintFamily, Controller, PrepareError, StepError,
         abort_safe::{
-            AbortReason, AbortSafe, Artifact, Fallback, Measurement, Phase, Problem, Safety,
-            SetTiming, State, Step, Verdict, Watch, Weights, safety_report,
+            AbortOrigin, AbortReason, AbortSafe, Artifact, Fallback, Measurement, Phase, Problem,
+            Safety, SafetyQuestion, Separation, SetTiming, State, Step, Verdict, Watch, Weights,
+            safety_report,
         },
     },
     dynamics::{PeriodicPlant, RelativeVector},
@@ -51,6 +52,7 @@ fn station(safety_steps: usize) -> Problem {
         advance_within: Distance::from_metres(metres),
     };
     Problem {
+        epoch: None,
         orbit: KeplerOrbit::new(axis, 0.0, Angle::from_degrees(0.0), None).unwrap(),
         mass: Mass::from_kilograms(4000.0),
         sample_time: Seconds::from_seconds(30.0),
@@ -69,6 +71,7 @@ fn station(safety_steps: usize) -> Problem {
         prediction_horizon: 30,
         clearance: 1e-4,
         timing: SetTiming::Timed,
+        separation: Separation::Tangent,
         fallback: Fallback::Soften,
         arrival: Distance::from_metres(5.0),
         fastest_approach_m_s: 5.0,
@@ -167,14 +170,15 @@ fn first_commands_on_an_eccentric_orbit_are_safe_and_certified() {
         flown.push(x);
         state = answer.next;
     }
-    let report = safety_report(&artifact, 0, 0, &flown, Budget::UNLIMITED).unwrap();
+    let question = SafetyQuestion { phase: None, first: 0, states: &flown, modes: None };
+    let report = safety_report(&artifact, &question, Budget::UNLIMITED).unwrap();
     assert_eq!(report.len(), 31);
     for verdict in &report {
         let mode = &verdict.modes[0];
         assert_eq!(mode.working, ThrustMode::NONE);
         // In free drift being outside every set and having an abort are the same.
-        assert_eq!(mode.inside_reachable_set, !matches!(mode.abort, AbortVerdict::Found(_)));
-        assert!(!mode.inside_reachable_set, "{verdict:?}");
+        assert_eq!(mode.inside_reachable_set(), !matches!(mode.abort, AbortVerdict::Found(_)));
+        assert!(!mode.inside_reachable_set(), "{verdict:?}");
     }
 }
 
@@ -224,26 +228,159 @@ fn station_artifact_survives_its_bytes() {
     assert_eq!(summary.phases[2].dominating_modes, singles());
     assert_eq!(summary.fold_error.seconds(), 0.0);
     assert_eq!(summary.phases[2].hides_approaches_above_m_s, None);
+    // All eight single thrusters were asked for, so their sets are all there are.
+    assert_eq!(summary.phases[2].sets_of_all_modes, Some(sets[2]));
+    // 5 m/s for 30 s is more than the box is wide.
+    assert_eq!(summary.phases[2].crosses_unseen_m, Some(150.0));
+    assert_eq!(summary.warnings().len(), 1, "{:?}", summary.warnings());
     let faster = Problem { fastest_approach_m_s: 10.0, ..station(60) };
     let summary = Artifact::prepare(&faster).unwrap().summary();
     assert_eq!(summary.phases[2].hides_approaches_above_m_s, Some(6.0));
+    assert!(summary.warnings()[0].contains("6 m/s"), "{:?}", summary.warnings());
+}
+
+/// 300 m from the approach ellipsoid at 12 m/s towards it.
+fn too_fast() -> RelativeVector {
+    RelativeVector::from_column_slice(&[0.0, 2300.0, 0.0, 0.0, -12.0, 0.0])
 }
 
 #[test]
 fn craft_that_cannot_keep_out_softens_aloud_or_leaves() {
-    // 300 m from the approach ellipsoid at 12 m/s towards it.
-    let x = RelativeVector::from_column_slice(&[0.0, 2300.0, 0.0, 0.0, -12.0, 0.0]);
-    let soft = first_step(&eccentric(200), &x);
+    let second_step = |problem: &Problem| {
+        let artifact = Artifact::prepare(problem).unwrap();
+        let first = step(&artifact, &AbortSafe::start(&artifact), &at(&start()));
+        step(&artifact, &first.next, &at(&too_fast()))
+    };
+    let soft = second_step(&eccentric(200));
     let Verdict::Command(command) = &soft.verdict else { panic!("{soft:?}") };
     assert!(command.softened && soft.diagnostics.violation > 0.0, "{:?}", soft.diagnostics);
-    assert!(!soft.safety.as_ref().unwrap().abort_always_exists());
-    let leaving = Problem { fallback: Fallback::Abort, ..eccentric(200) };
-    let answer = first_step(&leaving, &x);
+    assert!(!soft.safety.as_ref().unwrap().abort_always_exists() && soft.unsafe_state.is_some());
+    // Why, and what would have to give way: half-spaces by less than the softened step's largest
+    // violation, or thrust by more than there is.
+    let why = soft.diagnostics.infeasibility.unwrap();
+    let families: Vec<_> = why.relaxations.iter().map(|r| r.family).collect();
+    assert_eq!(families, [ConstraintFamily::State, ConstraintFamily::Input]);
+    let amount = why.relaxations[0].amount;
+    assert!(amount > 0.0 && amount <= soft.diagnostics.violation * (1.0 + 1e-6), "{why:?}");
+    assert!(why.relaxations[1].amount > 0.0 && !why.rows.is_empty());
+    let answer = second_step(&Problem { fallback: Fallback::Abort, ..eccentric(200) });
     match &answer.verdict {
         Verdict::Abort(command) => assert_eq!(command.reason, AbortReason::NoTrajectory),
         Verdict::Infeasible(why) => assert!(!why.rows.is_empty(), "{why:?}"),
         other => panic!("{other:?}"),
     }
+}
+
+#[test]
+fn start_inside_the_unsafe_set_is_refused_with_a_state_outside() {
+    let refused = first_step(&eccentric(200), &too_fast());
+    let Verdict::Infeasible(why) = &refused.verdict else { panic!("{refused:?}") };
+    assert!(
+        why.reason.starts_with("the start is inside the unsafe set: without thrust"),
+        "{why:?}"
+    );
+    assert_eq!(why.rows[0].family, ConstraintFamily::InitialState);
+    let found = refused.unsafe_state.unwrap();
+    assert!((why.relaxations[0].amount - (1.0 - found.gauge)).abs() < 1e-15 && found.gauge < 1.0);
+    // 300 m at 12 m/s.
+    assert_eq!(found.doomed_after_s, 30.0, "{found:?}");
+    let outside = found.outside.unwrap();
+    println!("start inside: {:?} outside is {:?}", too_fast().as_slice(), outside.as_slice());
+    let again = first_step(&eccentric(200), &outside);
+    assert!(again.unsafe_state.is_none());
+    assert!(!matches!(&again.verdict, Verdict::Infeasible(why) if why.reason.contains("start")));
+    // Nearer than braking to rest, in metres and metres per second over the mean motion.
+    let rate = eccentric(200).orbit.mean_motion_rad_s();
+    let way = outside - too_fast();
+    let length = (way.fixed_rows::<3>(0).norm_squared()
+        + way.fixed_rows::<3>(3).norm_squared() / (rate * rate))
+        .sqrt();
+    assert!(length < 12.0 / rate, "{length} m");
+}
+
+#[test]
+fn start_without_a_way_to_steer_out_is_refused_in_an_active_phase() {
+    let mut problem = station(46);
+    problem.phases.drain(..2);
+    let x = RelativeVector::from_column_slice(&[0.0, 50.0, 0.0, 0.0, -1.0, 0.0]);
+    let refused = first_step(&problem, &x);
+    let Verdict::Infeasible(why) = &refused.verdict else { panic!("{refused:?}") };
+    assert!(why.reason.contains("alone do the chaser is in the region"), "{why:?}");
+    assert!(
+        first_step(&problem, &refused.unsafe_state.unwrap().outside.unwrap())
+            .unsafe_state
+            .is_none()
+    );
+}
+
+#[test]
+fn abort_goes_on_from_step_to_step_and_mends_itself() {
+    let mut problem = station(46);
+    problem.phases.drain(..2);
+    let artifact = Artifact::prepare(&problem).unwrap();
+    let plant = PeriodicPlant::new(&problem.orbit, problem.mass, problem.sample_time, 1, 1);
+    let mut x = RelativeVector::from_column_slice(&[5.0, 160.0, 0.0, 0.0, -0.6, 0.0]);
+    let mut state = step(&artifact, &AbortSafe::start(&artifact), &at(&x)).next;
+    let failed = |x: &RelativeVector, k: usize| Measurement {
+        // Said once; later measurements need not repeat it.
+        working: if k == 1 { ThrustMode::of([7]) } else { None },
+        ..at(x)
+    };
+    let mut origins = Vec::new();
+    for k in 1..60 {
+        let answer = step(&artifact, &state, &failed(&x, k));
+        let Verdict::Abort(command) = &answer.verdict else { panic!("{k}: {answer:?}") };
+        assert_eq!((command.began, command.working), (1, ThrustMode::of([7]).unwrap()));
+        let reason = if k == 1 { AbortReason::Failure } else { AbortReason::UnderWay };
+        assert_eq!((command.reason, command.abort.horizon), (reason, 46));
+        assert!(command.abort.margin_throughout > 0.0);
+        origins.push(command.origin);
+        let force = command.abort.forces_n.first().copied().unwrap_or_default();
+        x = plant.advance(k, &x, &force);
+        if k == 10 {
+            // Pushed 1 m/s off its way: what was found may not do any longer.
+            x[4] -= 1.0;
+        }
+        assert!(x.fixed_rows::<3>(0).amax() > 20.0, "{k}: {x}");
+        state = State::from_bytes(&answer.next.to_bytes()).unwrap();
+        assert_eq!(state, answer.next);
+        assert!(state.is_aborting());
+    }
+    assert_eq!(origins[0], AbortOrigin::Searched);
+    assert!(origins.contains(&AbortOrigin::Kept), "{origins:?}");
+}
+
+#[test]
+fn common_half_spaces_are_taken_where_they_exist() {
+    let mut problem = eccentric(200);
+    if let Safety::Passive(watch) = &mut problem.phases[0].safety {
+        watch.nearest = 3;
+    }
+    let x = RelativeVector::from_column_slice(&[200.0, 5000.0, 100.0, 0.0, -1.0, 0.0]);
+    let tangents = first_step(&problem, &x);
+    problem.separation = Separation::SecondOrderCone;
+    let common = first_step(&problem, &x);
+    assert_eq!(tangents.diagnostics.cuts, 90);
+    assert!((30..90).contains(&common.diagnostics.cuts), "{}", common.diagnostics.cuts);
+    for answer in [&tangents, &common] {
+        assert!(answer.certificate.as_ref().unwrap().passed);
+        assert!(answer.safety.as_ref().unwrap().abort_always_exists());
+    }
+    // For one set a phase the programs are their closed form.
+    let mut single = station(46);
+    single.phases.drain(..2);
+    single.separation = Separation::LinearProgram;
+    let x = RelativeVector::from_column_slice(&[5.0, 160.0, 0.0, 0.0, -0.3, 0.0]);
+    let program = first_step(&single, &x);
+    let closed = first_step(&Problem { separation: Separation::Tangent, ..single }, &x);
+    let force = |answer: &Step| match &answer.verdict {
+        Verdict::Command(command) => command.force_n,
+        other => panic!("{other:?}"),
+    };
+    assert!((force(&program) - force(&closed)).norm() < 1e-3, "{program:?}");
+    let wrong = Problem { separation: Separation::LinearProgram, ..problem };
+    let PrepareError::Faults(faults) = Artifact::prepare(&wrong).unwrap_err() else { panic!() };
+    assert_eq!(faults[0].field, "separation");
 }
 
 #[test]
@@ -253,8 +390,10 @@ fn failed_thrusters_in_a_passive_phase_mean_drift() {
     let answer = step(&artifact, &AbortSafe::start(&artifact), &measurement);
     let Verdict::Abort(command) = &answer.verdict else { panic!("{answer:?}") };
     assert_eq!(command.reason, AbortReason::Failure);
-    assert!(command.abort.forces_n.iter().all(|force| force.norm() == 0.0));
-    assert_eq!(command.abort.forces_n.len(), 212);
+    // An abort that does nothing, verified over the whole horizon.
+    assert_eq!((command.abort.throttles.len(), command.abort.horizon), (0, 212));
+    assert_eq!(command.origin, AbortOrigin::Searched);
+    assert!(command.abort.margin > 0.0 && command.abort.flight.states().len() == 213);
 }
 
 #[test]
@@ -285,7 +424,7 @@ fn wrong_measurements_and_states_are_named() {
     let error = AbortSafe::step(&artifact, &state, &measurement, Budget::UNLIMITED).unwrap_err();
     let StepError::Measurement(faults) = error else { panic!("{error:?}") };
     let fields: Vec<&str> = faults.iter().map(|fault| fault.field.as_str()).collect();
-    assert_eq!(fields, ["state", "elapsed", "working"]);
+    assert_eq!(fields, ["relative", "elapsed_s", "working_thrusters"]);
     let later = step(&artifact, &state, &at(&start())).next;
     let shorter = Problem { prediction_horizon: 10, ..station(20) };
     let other = Artifact::prepare(&shorter).unwrap();
@@ -313,13 +452,13 @@ fn every_fault_of_a_problem_is_reported() {
     let PrepareError::Faults(faults) = error else { panic!("{error:?}") };
     let fields: Vec<&str> = faults.iter().map(|fault| fault.field.as_str()).collect();
     let expected = [
-        "mass",
-        "steps_per_period",
+        "mass_kg",
+        "sample_time_s",
         "prediction_horizon",
         "clearance",
-        "phases[0].fractions",
+        "phases[0].passive.watch.fractions",
         "phases[1].weights.input",
-        "phases[2].modes",
+        "phases[2].active.modes",
     ];
     assert_eq!(fields, expected);
 }

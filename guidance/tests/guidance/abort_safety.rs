@@ -48,7 +48,7 @@ fn sets_ending_at_0(modes: &[ThrustMode], horizon: usize) -> Vec<(usize, usize, 
             horizon: j,
         };
         let start = (kp - j) % kp;
-        let union = PolytopeUnion::new(&question, start..start + 1);
+        let union = PolytopeUnion::new(&question, start..start + 1, Budget::UNLIMITED).unwrap();
         let ending = union.sets(start).filter(|set| set.instant == j);
         found.extend(ending.map(|set| (j, set.mode, set.offsets.to_vec())));
     }
@@ -87,6 +87,64 @@ fn few_modes_stand_for_all_without_total_failure() {
 }
 
 #[test]
+fn few_modes_hold_the_states_that_all_hold() {
+    let (plant, avoid, forces) = (plant(1), cube(), thrusters().full_forces_n());
+    let all = thrusters().failure_modes();
+    let union = |modes: &[ThrustMode]| {
+        let bits: Vec<u32> = modes.iter().map(|mode| mode.bits()).collect();
+        let question = PolytopeQuestion {
+            plant: &plant,
+            avoid: &avoid,
+            full_forces_n: &forces,
+            modes: &bits,
+            horizon: 47,
+        };
+        let union = PolytopeUnion::new(&question, 0..1, Budget::UNLIMITED).unwrap();
+        let count = PolytopeUnion::count(&question, 0..1, Budget::UNLIMITED).unwrap();
+        assert_eq!(union.len(), count);
+        union
+    };
+    let mut rng = ChaCha8Rng::seed_from_u64(20_221_121);
+    // Without total failure and with it.
+    for modes in [&all[1..], &all[..]] {
+        let (whole, few) = (union(modes), union(&dominating_modes(modes)));
+        assert!(few.len() * 15 < whole.len(), "{} of {}", few.len(), whole.len());
+        let mut inside = 0;
+        for case in 0..3000 {
+            let x = RelativeVector::from_fn(|i, _| {
+                let half = if i < 3 { 40.0 } else { 1.0 };
+                rng.random_range(-half..half)
+            });
+            let held = |union: &PolytopeUnion| union.sets(0).any(|set| set.contains(&x));
+            assert_eq!(held(&whole), held(&few), "case {case}: {x}");
+            inside += usize::from(held(&few));
+        }
+        assert!(inside > 100, "{inside} inside: a vain test");
+    }
+}
+
+#[test]
+fn making_sets_stops_when_told() {
+    let (plant, avoid, forces) = (plant(1), cube(), thrusters().full_forces_n());
+    let asked = std::sync::atomic::AtomicUsize::new(0);
+    let stop = || {
+        let count = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        (count >= 3).then_some(Interruption::Deadline)
+    };
+    let modes = [ThrustMode::NONE.bits()];
+    let question = PolytopeQuestion {
+        plant: &plant,
+        avoid: &avoid,
+        full_forces_n: &forces,
+        modes: &modes,
+        horizon: 54,
+    };
+    let stopped = PolytopeUnion::new(&question, 0..4, Budget::new(&stop));
+    assert_eq!(stopped, Err(Interruption::Deadline));
+    assert_eq!(asked.into_inner(), 4);
+}
+
+#[test]
 fn total_failure_stands_for_all() {
     let all = thrusters().failure_modes();
     let sets = sets_ending_at_0(&all, 47);
@@ -113,6 +171,7 @@ fn question<'a>(
         start: 0,
         horizon: 54,
         programs_max: 5000,
+        throughout: false,
     }
 }
 
@@ -126,7 +185,10 @@ fn is_member(plant: &PeriodicPlant, mode: ThrustMode, x: &RelativeVector) -> boo
         modes: &modes,
         horizon: 54,
     };
-    PolytopeUnion::new(&question, 0..1).sets(0).any(|set| set.contains(x))
+    PolytopeUnion::new(&question, 0..1, Budget::UNLIMITED)
+        .unwrap()
+        .sets(0)
+        .any(|set| set.contains(x))
 }
 
 /// Outside every backward reachable set, and yet no abort: found by the independent
@@ -245,7 +307,7 @@ fn general_polytopes_are_propagated_and_emptied_as_boxes_are() {
             modes: &modes,
             horizon: 7,
         };
-        PolytopeUnion::new(&question, 30..31)
+        PolytopeUnion::new(&question, 30..31, Budget::UNLIMITED).unwrap()
     };
     let (boxes, generals) = (of(&cube), of(&general));
     let names = |union: &PolytopeUnion| -> Vec<(usize, usize)> {
@@ -268,7 +330,7 @@ fn cuts_hold_their_set_and_leave_the_state_out() {
         modes: &modes,
         horizon: 54,
     };
-    let union = PolytopeUnion::new(&question, 0..1);
+    let union = PolytopeUnion::new(&question, 0..1, Budget::UNLIMITED).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let x = RelativeVector::from_column_slice(&[-75.7, 95.1, -54.7, 1.0, -1.1, 0.7]);
     let mut without_origin = 0;

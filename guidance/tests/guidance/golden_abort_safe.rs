@@ -332,7 +332,7 @@ fn check_ellipsoids(case: &Case<'_>) {
     for (kj, expected) in list(&case.inputs["kj"]).iter().zip(list(&case.expected["Qinv"])) {
         let kj = numbers(kj);
         let (k, j) = (kj[0] as usize, kj[1] as usize);
-        let union = EllipsoidUnion::new(&plant, &set, j, k..k + 1);
+        let union = EllipsoidUnion::new(&plant, &set, j, k..k + 1, Budget::UNLIMITED).unwrap();
         compare_precision(case, &union.precision(k, j), &matrix(expected));
     }
 }
@@ -387,7 +387,7 @@ fn set_that_ends(
     let start = (case.index("kf") + kp * (1 + j / kp) - j) % kp;
     let forces = case.thrusters.full_forces_n();
     let question = PolytopeQuestion { plant, avoid, full_forces_n: &forces, modes, horizon: j };
-    let union = PolytopeUnion::new(&question, start..start + 1);
+    let union = PolytopeUnion::new(&question, start..start + 1, Budget::UNLIMITED).unwrap();
     let set = union.sets(start).find(|set| set.instant == j)?;
     Some((set.normals.to_vec(), set.offsets.to_vec()))
 }
@@ -413,7 +413,7 @@ fn check_inflation(case: &Case<'_>) {
     let x = state(&case.inputs["x"]);
     let union_of = |gamma: f64| {
         let set = case.ellipsoid().inflated(gamma).unwrap().ellipsoid().unwrap();
-        EllipsoidUnion::new(&plant, &set, j, k..k + 1)
+        EllipsoidUnion::new(&plant, &set, j, k..k + 1, Budget::UNLIMITED).unwrap()
     };
     let q = |union: &EllipsoidUnion| {
         let mut gauges = Vec::new();
@@ -455,7 +455,7 @@ fn check_ellipsoid_distance(case: &Case<'_>) {
         let (k, j) = (case.index("k"), case.index("j"));
         let plant = case.plant();
         let own = case.ellipsoid().ellipsoid().unwrap();
-        let union = EllipsoidUnion::new(&plant, &own, j, k..k + 1);
+        let union = EllipsoidUnion::new(&plant, &own, j, k..k + 1, Budget::UNLIMITED).unwrap();
         compare_precision(case, &union.precision(k, j), &matrix(&case.inputs["Qinv"]));
     }
     let x = dynamic(&state(&case.inputs["x"]));
@@ -581,7 +581,14 @@ fn check_separation_without_origin(case: &Case<'_>) {
 fn check_nearest_untimed(case: &Case<'_>) {
     let plant = case.plant();
     let set = case.ellipsoid().ellipsoid().unwrap();
-    let union = EllipsoidUnion::new(&plant, &set, case.index("N"), 0..plant.steps_per_period());
+    let union = EllipsoidUnion::new(
+        &plant,
+        &set,
+        case.index("N"),
+        0..plant.steps_per_period(),
+        Budget::UNLIMITED,
+    )
+    .unwrap();
     let expected = case.expected;
     assert_eq!(union.len() as u64, expected["n_sets"].as_u64().unwrap(), "{}", case.label);
     let (k, j) = (numbers(&expected["k"]), numbers(&expected["j"]));
@@ -620,7 +627,7 @@ fn check_membership(case: &Case<'_>) {
             modes: &modes,
             horizon,
         };
-        let union = PolytopeUnion::new(&question, k..k + 1);
+        let union = PolytopeUnion::new(&question, k..k + 1, Budget::UNLIMITED).unwrap();
         let x = state(&result["x"]);
         let inside: Vec<f64> =
             union.sets(k).filter(|set| set.contains(&x)).map(|set| set.instant as f64).collect();
@@ -635,6 +642,7 @@ fn check_membership(case: &Case<'_>) {
             start: k,
             horizon,
             programs_max: 200_000,
+            throughout: false,
         };
         let verdict = find_abort(&question, &x, Budget::UNLIMITED).unwrap();
         let (exists, programs) = match &verdict {
@@ -798,7 +806,9 @@ fn check_closed_loop(case: &Case<'_>) {
     // Three periods, as everywhere in the paper's passive cases.
     let horizon = horizon.unwrap_or(3 * plant.steps_per_period());
     let set = case.ellipsoid().ellipsoid().unwrap();
-    let union = EllipsoidUnion::new(&plant, &set, horizon, 0..plant.steps_per_period());
+    let union =
+        EllipsoidUnion::new(&plant, &set, horizon, 0..plant.steps_per_period(), Budget::UNLIMITED)
+            .unwrap();
     let rho = number(&case.inputs["rho"]);
     let mut x = state(&case.inputs["x0"]);
     let mut points = vec![x; regulator.steps + 1];

@@ -604,7 +604,8 @@ fn sampled_rows(case: &Value) -> HalfSpaces {
     let mut rows = HalfSpaces::new(n + horizon * count(&case["m"]));
     for prediction in predictions(case, false) {
         for &group in &groups {
-            constraints.push_rows(group, &prediction, &mut rows);
+            let faces: Vec<usize> = (0..constraints.of(group.family).len()).collect();
+            constraints.push_rows(group, &faces, &prediction, &mut rows);
         }
     }
     rows

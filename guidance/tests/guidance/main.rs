@@ -4,6 +4,8 @@
 
 mod abort_safe_loop;
 mod abort_safety;
+mod abort_search;
+mod chance_constraints;
 mod disturbance_feedback_golden;
 mod disturbance_feedback_laws;
 mod double_integrator;
@@ -11,6 +13,7 @@ mod golden;
 mod golden_abort_safe;
 mod golden_offline_sampling;
 mod growth;
+mod hill_docking;
 mod laws;
 mod offline_sampling;
 mod offline_sampling_baselines;

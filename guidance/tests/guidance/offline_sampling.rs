@@ -8,7 +8,8 @@ use vbar_guidance::{
     control::{
         Claim, ConstraintFamily, Controller, PrepareError, StepError,
         offline_sampling::{
-            Artifact, Branch, Measurement, OfflineSampling, Redundancy, RowOrigin, State, Verdict,
+            Artifact, Branch, GainChoice, Measurement, OfflineSampling, Redundancy, RowOrigin,
+            State, Verdict,
         },
     },
     dynamics::Discretisation,
@@ -110,9 +111,10 @@ fn offline_sampling_refuses_what_does_not_fit() {
     assert_eq!(faults[0].field, "samples.rows_max");
     assert!(faults[0].got.ends_with(" rows") && faults[0].expected == "at most 10000 rows");
 
-    // Stable where the input is as strong as expected or stronger, not where it is weaker.
+    // Stable where the input has an effect, not where it may have none.
     let mut weak = problem();
-    weak.plant.parameters = vec![ScalarLaw::Uniform { low: -1.0, high: 1.0 }];
+    weak.plant.parameters = vec![ScalarLaw::Uniform { low: -1.0, high: 0.1 }];
+    weak.gain = GainChoice::Explicit(DMatrix::from_row_slice(1, 2, &[-0.4, -1.1]));
     let Err(PrepareError::Faults(faults)) = prepare(&weak) else { panic!("accepted") };
     assert_eq!(faults.len(), 1, "{faults:?}");
     assert!(faults[0].field == "gain" && faults[0].got.contains("vertex 0 of 2"), "{faults:?}");
@@ -135,8 +137,8 @@ fn offline_sampling_without_a_terminal_set_says_how_far_the_target_must_move() {
     assert!(why.reason.contains("row 2 of state_set"), "{}", why.reason);
     let [relaxation] = why.relaxations[..] else { panic!("{why:?}") };
     assert_eq!(relaxation.family, ConstraintFamily::State);
-    // What was said is enough, and nine tenths of it are not.
-    for (share, enough) in [(1.0, true), (0.9, false)] {
+    // A little more than what was said leaves room, nine tenths of it do not.
+    for (share, enough) in [(1.1, true), (0.9, false)] {
         offsets[2] = share * relaxation.amount;
         let mut moved = blunt.clone();
         moved.state_set = Polytope::new(moved.state_set.normals().clone(), offsets.clone());

@@ -9,7 +9,7 @@ use vbar_guidance::control::Infeasibility;
 
 use crate::{
     store::Shelf,
-    wire::{ArtifactAnswer, ArtifactId, Problem},
+    wire::{ArtifactId, Problem, StoredArtifact},
 };
 
 /// What is remembered, by the shelf it stands on in the store.
@@ -19,7 +19,7 @@ pub(super) type Key = (Shelf, ArtifactId);
 #[derive(Debug, Clone)]
 pub(crate) enum Outcome {
     /// An artifact, which is also in the store.
-    Made(ArtifactAnswer),
+    Made(StoredArtifact),
     /// There is none. Remembered here only: it is cheap to find out again.
     Infeasible(Problem, Arc<Infeasibility>),
 }
@@ -70,6 +70,14 @@ impl Cache {
         let entry = entries.by_id.get_mut(id)?;
         entry.used = now;
         Some(entry.outcome.clone())
+    }
+
+    /// Forgets what is remembered of `id`.
+    pub(super) fn forget(&self, id: &Key) {
+        let mut entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(forgotten) = entries.by_id.remove(id) {
+            entries.bytes -= forgotten.outcome.bytes();
+        }
     }
 
     /// Remembers `outcome`; forgets what was not used for longest if there is no room. The newest
@@ -169,6 +177,19 @@ mod tests {
         cache.insert(key(4), outcome("again"));
         assert_eq!(reason(&cache, 4).as_deref(), Some("again"));
         assert_eq!(reason(&cache, 1).as_deref(), Some("1"));
+    }
+
+    #[test]
+    fn cache_forgets_when_told_and_has_room_again() {
+        let cache = Cache::new(2 * outcome("").bytes());
+        for n in [1, 2] {
+            cache.insert(key(n), outcome(&n.to_string()));
+        }
+        cache.forget(&key(1));
+        cache.forget(&key(1));
+        assert_eq!(reason(&cache, 1), None);
+        cache.insert(key(3), outcome("3"));
+        assert_eq!(reason(&cache, 2).as_deref(), Some("2"));
     }
 
     #[test]

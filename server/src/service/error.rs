@@ -10,7 +10,7 @@ use vbar_guidance::{
 use crate::{
     compute::ComputeError,
     store::StoreError,
-    wire::{Missing, StateFault, Violation, Violations},
+    wire::{self, Missing, ReportFault, StateFault, Violation, Violations},
 };
 
 /// The codes of `google.rpc.Code` that this service answers with.
@@ -20,6 +20,7 @@ pub(crate) enum Code {
     InvalidArgument,
     DeadlineExceeded,
     NotFound,
+    AlreadyExists,
     ResourceExhausted,
     FailedPrecondition,
     OutOfRange,
@@ -37,6 +38,7 @@ impl Code {
             Self::InvalidArgument => 3,
             Self::DeadlineExceeded => 4,
             Self::NotFound => 5,
+            Self::AlreadyExists => 6,
             Self::ResourceExhausted => 8,
             Self::FailedPrecondition => 9,
             Self::OutOfRange => 11,
@@ -143,8 +145,31 @@ impl From<Violations> for Error {
     }
 }
 
+impl From<Error> for wire::Failure {
+    fn from(error: Error) -> Self {
+        Self {
+            code: error.code.number(),
+            reason: error.reason.to_owned(),
+            message: error.message,
+            violations: error.violations,
+        }
+    }
+}
+
 fn place(path: &str) -> &str {
     if path.is_empty() { "the request" } else { path }
+}
+
+impl From<ReportFault> for Error {
+    fn from(fault: ReportFault) -> Self {
+        match fault {
+            ReportFault::Violations(violations) => violations.into(),
+            ReportFault::Interrupted(interruption) => Failure::from(interruption).into(),
+            ReportFault::TooLarge(what) => {
+                Self::new(Code::ResourceExhausted, "REPORT_TOO_LARGE", what)
+            }
+        }
+    }
 }
 
 impl From<StateFault> for Error {
@@ -197,7 +222,7 @@ impl From<StoreError> for Error {
             StoreError::Full(_) => {
                 Self::new(Code::ResourceExhausted, "STORE_FULL", fault.to_string())
             }
-            StoreError::Io { .. } => {
+            StoreError::Stale { .. } | StoreError::InUse(_) | StoreError::Io { .. } => {
                 tracing::error!(%fault, "store");
                 let message = "the artifact store does not answer";
                 Self::new(Code::Unavailable, "STORE_UNAVAILABLE", message)

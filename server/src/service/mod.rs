@@ -1,16 +1,23 @@
 //! The service: what each call means, whatever it came over.
 
+mod artifacts;
 mod cache;
 mod error;
+mod jobs;
+mod leases;
+mod operations;
 mod record;
 mod session;
+mod shelves;
 
 use std::{
+    io,
     sync::Arc,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use bytes::Bytes;
+use tokio::sync::Semaphore;
 use vbar_guidance::{
     Budget, Method,
     control::{Certificate, PrepareError, StepError},
@@ -20,21 +27,28 @@ pub(crate) use crate::compute::Timed;
 pub(crate) use error::{Code, Error};
 pub(crate) use session::{Session, SessionAnswer};
 
+pub(crate) use artifacts::Range;
+pub(crate) use operations::Watching;
+
 use crate::{
     compute::Compute,
-    store::{Put, RecordStore, Shelf},
+    config::Config,
+    store::{Shelf, Store},
     telemetry::{Metrics, OutcomeLabels},
     wire::{
-        Artifact, ArtifactAnswer, ArtifactCall, ArtifactId, Controller, ControllerState,
-        DecidedStep, Document, ElapsedAndState, ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer,
-        KeptPlanCall, Limits, OperationAnswer, OperationName, OperationsAnswer, OperationsCall,
-        PlanAnswer, PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, PrecomputeCall,
-        Problem, Provenance, SolverWork, State, StateFault, StepAnswer, StepCall, UploadAnswer,
-        UploadCall, VerdictKind,
+        Artifact, ArtifactId, Controller, ControllerState, DecidedStep, Document, ElapsedAndState,
+        ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer, KeptPlanCall, Limits, PlanAnswer,
+        PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, Problem, ReportAnswer,
+        ReportCall, SolverWork, State, StateFault, StepAnswer, StepCall, StoredArtifact,
+        UploadAnswer, UploadCall, VerdictKind,
     },
 };
 use cache::{Cache, Outcome};
+use jobs::{JobLimits, Jobs};
+use leases::Leases;
+use operations::Precompute;
 use session::StateSource;
+use shelves::{Shelves, provenance};
 
 /// Where a problem's own message stands in every request that carries one.
 fn problem_path(method: Method) -> String {
@@ -42,7 +56,7 @@ fn problem_path(method: Method) -> String {
 }
 
 /// A decoded artifact with where it comes from.
-type Loaded = ArtifactAnswer;
+type Loaded = StoredArtifact;
 
 /// The controller that a step names, or the answer that there is none.
 enum Found {
@@ -57,27 +71,78 @@ pub(crate) struct Call {
     pub(crate) deadline: Instant,
 }
 
+impl Call {
+    /// When to answer with what there is, so that it still arrives in time.
+    fn answer_by(&self) -> Instant {
+        let left = self.deadline.saturating_duration_since(Instant::now());
+        self.deadline - (left / 10).min(Duration::from_millis(500))
+    }
+}
+
 /// The service.
 #[derive(Debug)]
 pub(crate) struct Service {
     compute: Compute,
-    store: Arc<dyn RecordStore>,
-    cache: Cache,
+    shelves: Arc<Shelves>,
+    jobs: Arc<Jobs<Precompute>>,
+    watching: Arc<Semaphore>,
+    precompute_wait: Duration,
     metrics: Arc<Metrics>,
     info: InfoAnswer,
 }
 
 impl Service {
-    /// A service that computes with `compute`, keeps artifacts and plans in `store` and at most
-    /// `cache_bytes_max` bytes of them in memory.
-    pub(crate) fn new(
+    /// A service that computes with `compute` and keeps what it makes in `store`. Goes on with the
+    /// jobs that the store remembers. Blocks on the store.
+    ///
+    /// # Errors
+    /// If the store cannot be read or the system gives no thread for jobs.
+    pub(crate) fn open(
         compute: Compute,
-        store: Arc<dyn RecordStore>,
-        cache_bytes_max: usize,
+        store: Arc<dyn Store>,
+        config: &Config,
         metrics: Arc<Metrics>,
         info: InfoAnswer,
-    ) -> Self {
-        Self { compute, store, cache: Cache::new(cache_bytes_max), metrics, info }
+    ) -> io::Result<Self> {
+        let leases =
+            Leases::open(Arc::clone(&store), config.artifact_lifetime, config.artifact_bytes_max)
+                .map_err(io::Error::other)?;
+        let shelves = Arc::new(Shelves {
+            store: Arc::clone(&store),
+            cache: Cache::new(config.cache_bytes_max),
+            leases,
+            metrics: Arc::clone(&metrics),
+        });
+        let limits = JobLimits {
+            threads: config.job_threads,
+            unfinished_max: config.jobs_unfinished_max,
+            time_max: config.job_time_max,
+            attempts_max: config.job_attempts_max,
+            kept_for: config.operation_lifetime,
+        };
+        let jobs = Jobs::open(store, limits, Arc::clone(&metrics), |id, problem| {
+            Precompute::again(id, problem, &info.limits, &shelves)
+        })?;
+        let jobs = Arc::new(jobs);
+        let watching = Arc::new(Semaphore::new(config.watchers_max));
+        let precompute_wait = config.precompute_wait;
+        Ok(Self { compute, shelves, jobs, watching, precompute_wait, metrics, info })
+    }
+
+    /// Writes down and removes what time has changed. Blocks on the store.
+    pub(crate) fn sweep(&self) {
+        let now = SystemTime::now();
+        for id in self.shelves.leases.sweep(now) {
+            self.shelves.cache.forget(&(Shelf::Artifacts, id));
+            self.metrics.artifacts_expired.inc();
+            tracing::info!(%id, "artifact expired");
+        }
+        self.jobs.sweep(now);
+    }
+
+    /// Hands back what jobs are at and lets nobody wait any longer. Blocks on the store.
+    pub(crate) fn stop(&self) {
+        self.jobs.stop();
     }
 
     /// The limits in force.
@@ -116,6 +181,31 @@ impl Service {
         decided.await.map(|timed| timed.map(StepAnswer::Decided))
     }
 
+    /// `SafetyReport`.
+    pub(crate) async fn safety_report(
+        &self,
+        ask: ReportCall,
+        call: &Call,
+    ) -> Result<Timed<ReportAnswer>, Error> {
+        let loaded = match self.controller(ask.controller, call).await? {
+            Found::Controller(loaded) => loaded,
+            Found::None(_) => {
+                let message = "no controller exists for the problem";
+                return Err(Error::new(Code::FailedPrecondition, "NO_CONTROLLER", message));
+            }
+        };
+        let question = ask.question;
+        let plan = match question.plan() {
+            Some(id) => Some(self.load(Shelf::Plans, id, call).await?.artifact),
+            None => None,
+        };
+        let Loaded { artifact, provenance, .. } = loaded;
+        let work =
+            move |budget: Budget<'_>| question.judge(artifact, plan.as_ref(), provenance, budget);
+        let timed = self.compute.run("safety_report", call.deadline, work).await?;
+        Ok(Timed { value: timed.value?, compute: timed.compute })
+    }
+
     /// `ComputePlan`. What can be flown as it is, is kept.
     pub(crate) async fn plan(
         &self,
@@ -140,13 +230,13 @@ impl Service {
                 return Ok(Timed { value, compute: Duration::ZERO });
             }
         };
-        let (artifact, store) = (loaded.artifact, Arc::clone(&self.store));
+        let (artifact, shelves) = (loaded.artifact, Arc::clone(&self.shelves));
         let initial = ask.initial;
         let work = move |budget: Budget<'_>| -> Result<(PlanVerdict, Option<Loaded>), Error> {
             let verdict = artifact.plan(initial.as_ref(), budget);
             let verdict = verdict.map_err(|fault| Error::step("initial", fault))?;
             let sound = verdict.certificate.as_ref().is_none_or(|certificate| certificate.passed);
-            let kept = (sound && artifact.is_plan()).then(|| keep_plan(&*store, artifact));
+            let kept = (sound && artifact.is_plan()).then(|| shelves.keep_plan(artifact));
             Ok((verdict, kept.transpose()?))
         };
         let timed = self.compute.run("plan", call.deadline, work).await?;
@@ -156,7 +246,7 @@ impl Service {
             self.withhold_unless(certificate.passed, Some(certificate))?;
         }
         self.planned(if verdict.is_infeasible() { "infeasible" } else { "computed" });
-        let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
+        let plan_id = kept.map(|plan| self.shelves.remember(Shelf::Plans, plan).id);
         let outcome = Some(PlanResult::Decided(Box::new(verdict)));
         let value = PlanAnswer { provenance: loaded.provenance, outcome, plan_id };
         Ok(Timed { value, compute: timed.compute })
@@ -168,17 +258,17 @@ impl Service {
         ask: UploadCall,
         call: &Call,
     ) -> Result<Timed<UploadAnswer>, Error> {
-        let store = Arc::clone(&self.store);
+        let shelves = Arc::clone(&self.shelves);
         let UploadCall { candidate, validate_only } = ask;
         let work = move |_: Budget<'_>| -> Result<(Artifact, Option<Loaded>), Error> {
             let plan = candidate.verify()?;
-            let kept = (!validate_only).then(|| keep_plan(&*store, plan.clone()));
+            let kept = (!validate_only).then(|| shelves.keep_plan(plan.clone()));
             Ok((plan, kept.transpose()?))
         };
         let timed = self.compute.run("verify", call.deadline, work).await?;
         let (plan, kept) = timed.value.inspect_err(|_| self.planned("refused"))?;
         self.planned("uploaded");
-        let plan_id = kept.map(|plan| self.remember(Shelf::Plans, plan).id);
+        let plan_id = kept.map(|plan| self.shelves.remember(Shelf::Plans, plan).id);
         Ok(Timed { value: UploadAnswer { plan, plan_id }, compute: timed.compute })
     }
 
@@ -225,65 +315,6 @@ impl Service {
         }
     }
 
-    /// `Precompute`. It answers when it is done: an operation is its artifact.
-    pub(crate) async fn precompute(
-        &self,
-        ask: PrecomputeCall,
-        call: &Call,
-    ) -> Result<OperationAnswer, Error> {
-        if ask.validate_only {
-            let (id, _) = self.validate(ask.problem, call).await?.value;
-            return Ok(OperationAnswer::Validated { id });
-        }
-        let id = record::problem_id(&ask.problem);
-        Ok(operation(id, self.obtain(id, ask.problem, call).await?))
-    }
-
-    /// `GetArtifact`.
-    pub(crate) async fn artifact(
-        &self,
-        ask: ArtifactCall,
-        call: &Call,
-    ) -> Result<ArtifactAnswer, Error> {
-        self.load(Shelf::Artifacts, ask.id, call).await
-    }
-
-    /// `GetOperation` and `WaitOperation`: there is nothing to wait for, because
-    /// [`Service::precompute`] answers when it is done.
-    pub(crate) async fn operation(
-        &self,
-        ask: OperationName,
-        call: &Call,
-    ) -> Result<OperationAnswer, Error> {
-        match self.cache.get(&(Shelf::Artifacts, ask.id)) {
-            Some(outcome) => Ok(operation(ask.id, outcome)),
-            None => match self.load(Shelf::Artifacts, ask.id, call).await {
-                Ok(loaded) => Ok(OperationAnswer::Made(loaded)),
-                Err(error) if error.code == Code::NotFound => Err(Error::new(
-                    Code::NotFound,
-                    "OPERATION_UNKNOWN",
-                    format!("operation operations/{} is not known", ask.id),
-                )),
-                Err(error) => Err(error),
-            },
-        }
-    }
-
-    /// `ListOperations`: every stored artifact is a finished operation.
-    pub(crate) async fn operations(
-        &self,
-        ask: OperationsCall,
-        call: &Call,
-    ) -> Result<OperationsAnswer, Error> {
-        let (ids, next) = self.page(Shelf::Artifacts, ask.after, ask.page_size, call).await?;
-        let mut operations = Vec::with_capacity(ids.len());
-        for id in ids {
-            let loaded = self.load(Shelf::Artifacts, id, call).await?;
-            operations.push(OperationAnswer::Made(loaded));
-        }
-        Ok(OperationsAnswer { operations, next })
-    }
-
     /// Ids of one page of a shelf, and where the next page begins.
     async fn page(
         &self,
@@ -292,39 +323,15 @@ impl Service {
         page_size: usize,
         call: &Call,
     ) -> Result<(Vec<ArtifactId>, Option<ArtifactId>), Error> {
-        let store = Arc::clone(&self.store);
-        let list =
-            move |_: Budget<'_>| store.list(shelf, after.as_ref().map(|id| &id.0), page_size + 1);
+        let shelves = Arc::clone(&self.shelves);
+        let list = move |_: Budget<'_>| {
+            shelves.store.list(shelf, after.as_ref().map(|id| &id.0), page_size + 1)
+        };
         let mut ids = self.compute.run("list", call.deadline, list).await?.value?;
         let more = ids.len() > page_size;
         ids.truncate(page_size);
         let next = ids.last().filter(|_| more).map(|id| ArtifactId(*id));
         Ok((ids.into_iter().map(ArtifactId).collect(), next))
-    }
-
-    /// `CancelOperation`: an operation that can be named is done, and success promises nothing
-    /// (AIP-151).
-    pub(crate) async fn cancel_operation(
-        &self,
-        ask: OperationName,
-        call: &Call,
-    ) -> Result<(), Error> {
-        self.operation(ask, call).await.map(|_| ())
-    }
-
-    /// `DeleteOperation`: an operation has no record apart from its artifact, which must stay for
-    /// the steps that name it.
-    pub(crate) async fn delete_operation(
-        &self,
-        ask: OperationName,
-        call: &Call,
-    ) -> Result<(), Error> {
-        self.operation(ask, call).await?;
-        Err(Error::new(
-            Code::Unimplemented,
-            "OPERATION_IS_ITS_ARTIFACT",
-            "an operation has no record apart from its artifact, and artifacts are not deleted",
-        ))
     }
 
     /// Decides one step on a compute thread: state in, step, state out.
@@ -336,6 +343,7 @@ impl Service {
         omit_prediction: bool,
         call: &Call,
     ) -> Result<Timed<DecidedStep>, Error> {
+        let id = artifact.id;
         let work = move |budget: Budget<'_>| -> Result<DecidedStep, Error> {
             let state = match state {
                 StateSource::Decoded(state) => *state,
@@ -349,9 +357,11 @@ impl Service {
         };
         let timed = self.compute.run("step", call.deadline, work).await?;
         let answer = timed.value?;
+        self.shelves.leases.extend(id);
         self.count(answer.step.work());
         let outcome = match answer.step.kind() {
             VerdictKind::Command => "command",
+            VerdictKind::Abort => "abort",
             VerdictKind::Arrived => "arrived",
             VerdictKind::Infeasible => "infeasible",
         };
@@ -385,14 +395,14 @@ impl Service {
 
     /// What stands on a shelf.
     async fn load(&self, shelf: Shelf, id: ArtifactId, call: &Call) -> Result<Loaded, Error> {
-        if let Some(Outcome::Made(loaded)) = self.cache.get(&(shelf, id)) {
-            self.looked_up("hit");
+        if let Some(Outcome::Made(loaded)) = self.shelves.cache.get(&(shelf, id)) {
+            self.shelves.looked_up("hit");
             return Ok(loaded);
         }
-        let store = Arc::clone(&self.store);
-        let work = move |_: Budget<'_>| stored(&*store, shelf, id);
+        let shelves = Arc::clone(&self.shelves);
+        let work = move |_: Budget<'_>| shelves.stored(shelf, id);
         let Some(loaded) = self.compute.run("load", call.deadline, work).await?.value? else {
-            self.looked_up("unknown");
+            self.shelves.looked_up("unknown");
             let (reason, message) = match shelf {
                 Shelf::Artifacts => {
                     ("ARTIFACT_UNKNOWN", format!("artifact {id} is not known; Precompute makes it"))
@@ -401,14 +411,8 @@ impl Service {
             };
             return Err(Error::new(Code::NotFound, reason, message));
         };
-        self.looked_up("loaded");
-        Ok(self.remember(shelf, loaded))
-    }
-
-    /// Keeps what was loaded in memory for a while.
-    fn remember(&self, shelf: Shelf, loaded: Loaded) -> Loaded {
-        self.cache.insert((shelf, loaded.id), Outcome::Made(loaded.clone()));
-        loaded
+        self.shelves.looked_up("loaded");
+        Ok(self.shelves.remember(shelf, loaded))
     }
 
     /// What a precompute of `problem`, whose id is `id`, comes to: remembered, stored, or computed
@@ -420,13 +424,13 @@ impl Service {
         call: &Call,
     ) -> Result<Outcome, Error> {
         let key = (Shelf::Artifacts, id);
-        if let Some(outcome) = self.cache.get(&key) {
-            self.looked_up("hit");
+        if let Some(outcome) = self.shelves.cache.get(&key) {
+            self.shelves.looked_up("hit");
             return Ok(outcome);
         }
-        let store = Arc::clone(&self.store);
+        let shelves = Arc::clone(&self.shelves);
         let work = move |budget: Budget<'_>| -> Result<(Outcome, &'static str), Error> {
-            if let Some(loaded) = stored(&*store, Shelf::Artifacts, id)? {
+            if let Some(loaded) = shelves.stored(Shelf::Artifacts, id)? {
                 return Ok((Outcome::Made(loaded), "loaded"));
             }
             let artifact = match problem.prepare(budget) {
@@ -438,16 +442,12 @@ impl Service {
                     return Err(Error::prepare(&problem_path(problem.method()), fault));
                 }
             };
-            keep(&*store, id, artifact).map(|loaded| (Outcome::Made(loaded), "computed"))
+            shelves.keep(id, artifact).map(|loaded| (Outcome::Made(loaded), "computed"))
         };
         let timed = self.compute.run("precompute", call.deadline, work).await?;
-        let (outcome, source) = timed.value.inspect_err(|error| {
-            if error.reason == CONFLICT {
-                self.metrics.artifact_conflicts.inc();
-            }
-        })?;
-        self.looked_up(source);
-        self.cache.insert(key, outcome.clone());
+        let (outcome, source) = timed.value?;
+        self.shelves.looked_up(source);
+        self.shelves.cache.insert(key, outcome.clone());
         Ok(outcome)
     }
 
@@ -459,7 +459,7 @@ impl Service {
         call: &Call,
     ) -> Result<Timed<(ArtifactId, Method)>, Error> {
         let (id, method) = (record::problem_id(&problem), problem.method());
-        if self.cache.get(&(Shelf::Artifacts, id)).is_some() {
+        if self.shelves.cache.get(&(Shelf::Artifacts, id)).is_some() {
             return Ok(Timed { value: (id, method), compute: Duration::ZERO });
         }
         let work = move |budget: Budget<'_>| match problem.check(budget) {
@@ -495,88 +495,11 @@ impl Service {
     fn planned(&self, outcome: &'static str) {
         self.metrics.plans.get_or_create(&OutcomeLabels { outcome }).inc();
     }
-
-    fn looked_up(&self, outcome: &'static str) {
-        self.metrics.artifacts.get_or_create(&OutcomeLabels { outcome }).inc();
-    }
-}
-
-const CONFLICT: &str = "ARTIFACT_CONFLICT";
-
-fn operation(id: ArtifactId, outcome: Outcome) -> OperationAnswer {
-    match outcome {
-        Outcome::Made(loaded) => OperationAnswer::Made(loaded),
-        Outcome::Infeasible(problem, why) => OperationAnswer::Infeasible { id, problem, why },
-    }
-}
-
-fn provenance(method: Method, id: ArtifactId, content_sha256: String) -> Provenance {
-    Provenance {
-        method: method.name(),
-        method_version: method.version(),
-        artifact_id: id.to_string(),
-        content_sha256,
-    }
-}
-
-/// `id` is the name under which it was asked for: the problem's for an artifact, the content's for
-/// a plan. Controller states are bound to it.
-fn loaded(id: ArtifactId, artifact: Artifact, bytes: &[u8]) -> Loaded {
-    let method = artifact.method();
-    let problem = record::artifact_id(method, &artifact.canonical_problem());
-    let provenance = provenance(method, problem, record::content_id(bytes).to_string());
-    Loaded { id, artifact, provenance: Arc::new(provenance), size_bytes: bytes.len() }
 }
 
 fn kept_plan(loaded: Loaded) -> KeptPlanAnswer {
     let Loaded { id, artifact, provenance, size_bytes } = loaded;
     KeptPlanAnswer { id, plan: artifact, provenance, size_bytes }
-}
-
-/// Reads and checks what stands on a shelf under `id`.
-fn stored(store: &dyn RecordStore, shelf: Shelf, id: ArtifactId) -> Result<Option<Loaded>, Error> {
-    let Some(record) = store.get(shelf, &id.0)? else { return Ok(None) };
-    match record::decode(shelf, id, &record) {
-        Ok((artifact, bytes)) => Ok(Some(loaded(id, artifact, bytes))),
-        Err(what) => {
-            tracing::error!(%id, what, "unreadable record");
-            let (reason, kind) = match shelf {
-                Shelf::Artifacts => ("ARTIFACT_DAMAGED", "artifact"),
-                Shelf::Plans => ("PLAN_DAMAGED", "plan"),
-            };
-            let message = format!("the record of {kind} {id} cannot be used: {what}");
-            Err(Error::new(Code::DataLoss, reason, message))
-        }
-    }
-}
-
-/// Stores a new artifact. If another call was faster, both must have made the same bytes.
-fn keep(store: &dyn RecordStore, id: ArtifactId, artifact: Artifact) -> Result<Loaded, Error> {
-    put(store, Shelf::Artifacts, id, artifact)
-}
-
-/// Stores a plan under the digest of its content; the same plan twice is one plan.
-fn keep_plan(store: &dyn RecordStore, plan: Artifact) -> Result<Loaded, Error> {
-    let id = record::content_id(&plan.to_bytes());
-    put(store, Shelf::Plans, id, plan)
-}
-
-fn put(
-    store: &dyn RecordStore,
-    shelf: Shelf,
-    id: ArtifactId,
-    artifact: Artifact,
-) -> Result<Loaded, Error> {
-    let bytes = artifact.to_bytes();
-    let record = Bytes::from(record::encode(artifact.method(), &bytes));
-    match store.put_if_absent(shelf, &id.0, record.clone())? {
-        Put::Created => {}
-        Put::Existing(existing) if existing == record => {}
-        Put::Existing(_) => {
-            return Err(Error::internal(CONFLICT, &format!("two contents for {id}")));
-        }
-    }
-    Ok(loaded(id, artifact, &bytes))
 }
 
 /// Reads a controller state; an empty one means the start.

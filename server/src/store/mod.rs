@@ -1,8 +1,11 @@
-//! Where artifacts and plans are kept: bytes under ids, created once, never changed.
+//! Where artifacts and plans are kept: bytes under ids, created once, never changed; and what is
+//! to be remembered about work, whose entries do change.
 //!
-//! One contract, two back-ends, one conformance suite (below) that both pass. The store knows
-//! nothing of what the bytes mean.
+//! One contract, two back-ends, one conformance suite that both pass. The store knows nothing of
+//! what the bytes mean.
 
+#[cfg(test)]
+mod conformance;
 mod directory;
 mod memory;
 
@@ -10,7 +13,7 @@ use std::{fmt::Debug, io};
 
 use bytes::Bytes;
 
-pub(crate) use directory::DirectoryStore;
+pub(crate) use directory::{DirectoryStore, Syncing};
 pub(crate) use memory::MemoryStore;
 
 /// Names one record.
@@ -25,12 +28,36 @@ pub(crate) enum Shelf {
     Plans,
 }
 
-/// Keeps records.
+/// Kinds of entries, kept apart like the shelves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) enum Ledger {
+    /// Precomputes, under the id of the problem.
+    Jobs,
+    /// Which problem came with which request id.
+    Requests,
+    /// Until when artifacts are kept.
+    Leases,
+}
+
+/// How often an entry was written; 0 says that there is none.
+pub(crate) type Revision = u64;
+
+/// An entry of a ledger.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Entry {
+    /// What was written last.
+    pub(crate) bytes: Bytes,
+    /// To be given back by whoever wants to change it.
+    pub(crate) revision: Revision,
+}
+
+/// Keeps records and entries.
 ///
 /// Contract: a record is created whole or not at all; once `put_if_absent` has answered, `get`
-/// gives exactly those bytes or an error that says why not; nothing ever replaces them.
+/// gives exactly those bytes or an error that says why not; nothing ever replaces them. An entry
+/// is written whole or not at all, and only by whoever has seen its latest revision.
 /// Calls may block on a disk: call them where that is allowed.
-pub(crate) trait RecordStore: Debug + Send + Sync {
+pub(crate) trait Store: Debug + Send + Sync {
     /// Creates the record unless it exists; answers what is there already.
     fn put_if_absent(&self, shelf: Shelf, id: &RecordId, bytes: Bytes) -> Result<Put, StoreError>;
 
@@ -44,9 +71,36 @@ pub(crate) trait RecordStore: Debug + Send + Sync {
         after: Option<&RecordId>,
         limit: usize,
     ) -> Result<Vec<RecordId>, StoreError>;
+
+    /// Removes the record, if there is one.
+    fn remove(&self, shelf: Shelf, id: &RecordId) -> Result<(), StoreError>;
+
+    /// The entry, verified against its digest; `None` if there is none.
+    fn read(&self, ledger: Ledger, id: &RecordId) -> Result<Option<Entry>, StoreError>;
+
+    /// Writes the entry whose latest revision is `seen` (0 for a new one); answers the new one.
+    ///
+    /// # Errors
+    /// [`StoreError::Stale`] if somebody else wrote or erased it meanwhile.
+    fn write(
+        &self,
+        ledger: Ledger,
+        id: &RecordId,
+        bytes: Bytes,
+        seen: Revision,
+    ) -> Result<Revision, StoreError>;
+
+    /// Erases the entry whose latest revision is `seen`; nothing to do if there is none.
+    ///
+    /// # Errors
+    /// As [`Store::write`].
+    fn erase(&self, ledger: Ledger, id: &RecordId, seen: Revision) -> Result<(), StoreError>;
+
+    /// Ids of every entry, in ascending order.
+    fn entries(&self, ledger: Ledger) -> Result<Vec<RecordId>, StoreError>;
 }
 
-/// What came of [`RecordStore::put_if_absent`].
+/// What came of [`Store::put_if_absent`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Put {
     /// The record is new.
@@ -64,6 +118,12 @@ pub(crate) enum StoreError {
     /// There is no room.
     #[error("the store is full: {0}")]
     Full(String),
+    /// Another was faster.
+    #[error("entry {id} was changed meanwhile: revision {seen} was seen, {found} is there")]
+    Stale { id: String, seen: Revision, found: Revision },
+    /// Another process has it.
+    #[error("{0}")]
+    InUse(String),
     /// The world.
     #[error("{doing}: {source}")]
     Io { doing: String, source: io::Error },
@@ -75,86 +135,4 @@ fn hex(bytes: &[u8]) -> String {
         write!(text, "{byte:02x}").expect("a String takes everything");
         text
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn id(n: u8) -> RecordId {
-        let mut id = [0xa5; 32];
-        id[0] = n;
-        id
-    }
-
-    /// Every back-end keeps the contract, on every shelf.
-    fn check_conformance(store: &dyn RecordStore) {
-        check_shelf(store, Shelf::Artifacts);
-        // What stands on one shelf is not on the other.
-        check_shelf(store, Shelf::Plans);
-        let put = |shelf, text: &'static [u8]| store.put_if_absent(shelf, &id(200), text.into());
-        assert_eq!(put(Shelf::Artifacts, b"artifact").unwrap(), Put::Created);
-        assert_eq!(put(Shelf::Plans, b"plan").unwrap(), Put::Created);
-        let get = |shelf| store.get(shelf, &id(200)).unwrap();
-        assert_eq!(get(Shelf::Artifacts).as_deref(), Some(b"artifact".as_slice()));
-        assert_eq!(get(Shelf::Plans).as_deref(), Some(b"plan".as_slice()));
-    }
-
-    fn check_shelf(store: &dyn RecordStore, shelf: Shelf) {
-        assert_eq!(store.get(shelf, &id(1)).unwrap(), None);
-        assert_eq!(store.list(shelf, None, 10).unwrap(), Vec::<RecordId>::new());
-
-        let put =
-            |n: u8, text: &'static [u8]| store.put_if_absent(shelf, &id(n), text.into()).unwrap();
-        assert_eq!(put(2, b"two"), Put::Created);
-        assert_eq!(put(9, b""), Put::Created);
-        assert_eq!(put(1, b"one"), Put::Created);
-        // The first bytes stay, whatever comes later.
-        assert_eq!(put(2, b"two"), Put::Existing(b"two".as_slice().into()));
-        assert_eq!(put(2, b"other"), Put::Existing(b"two".as_slice().into()));
-
-        let get = |n: u8| store.get(shelf, &id(n)).unwrap();
-        assert_eq!(get(1).as_deref(), Some(b"one".as_slice()));
-        assert_eq!(get(2).as_deref(), Some(b"two".as_slice()));
-        assert_eq!(get(9).as_deref(), Some(b"".as_slice()));
-        assert_eq!(get(3), None);
-
-        let list = |after: Option<u8>, limit: usize| {
-            store.list(shelf, after.map(id).as_ref(), limit).unwrap()
-        };
-        assert_eq!(list(None, 10), [id(1), id(2), id(9)]);
-        assert_eq!(list(None, 2), [id(1), id(2)]);
-        assert_eq!(list(Some(2), 10), [id(9)]);
-        assert_eq!(list(Some(5), 10), [id(9)]);
-        assert_eq!(list(Some(9), 10), Vec::<RecordId>::new());
-
-        // Many writers, one winner, everybody sees the winner's bytes.
-        let seen: Vec<_> = std::thread::scope(|scope| {
-            let writers: Vec<_> = (0..8u8)
-                .map(|writer| {
-                    scope.spawn(move || {
-                        let bytes = Bytes::from(vec![writer; 1000]);
-                        store.put_if_absent(shelf, &id(100), bytes).unwrap()
-                    })
-                })
-                .collect();
-            writers.into_iter().map(|writer| writer.join().unwrap()).collect()
-        });
-        let winner = get(100).unwrap();
-        assert_eq!(seen.iter().filter(|put| **put == Put::Created).count(), 1);
-        for put in seen {
-            assert!(put == Put::Created || put == Put::Existing(winner.clone()));
-        }
-    }
-
-    #[test]
-    fn memory_store_conforms() {
-        check_conformance(&MemoryStore::new(1 << 20));
-    }
-
-    #[test]
-    fn directory_store_conforms() {
-        let folder = tempfile::tempdir().unwrap();
-        check_conformance(&DirectoryStore::open(folder.path()).unwrap());
-    }
 }

@@ -72,6 +72,14 @@ pub(crate) struct Metrics {
     pub(crate) artifact_conflicts: Counter,
     /// Plans: `computed`, `infeasible`, `uploaded`, `refused`, `exported`.
     pub(crate) plans: Family<OutcomeLabels, Counter>,
+    /// Jobs: `accepted`, `joined`, `resumed`, `succeeded`, `infeasible`, `failed`, `cancelled`.
+    pub(crate) jobs: Family<OutcomeLabels, Counter>,
+    /// Jobs that are not done.
+    pub(crate) jobs_unfinished: Gauge,
+    /// Time on a job thread, a shard.
+    pub(crate) job_shard_seconds: Histogram,
+    /// Artifacts removed because nobody used them for a whole term.
+    pub(crate) artifacts_expired: Counter,
     /// Open connections.
     pub(crate) connections: Gauge,
     /// Connections dropped because too many were open.
@@ -104,6 +112,10 @@ impl Metrics {
             artifacts: Family::default(),
             artifact_conflicts: Counter::default(),
             plans: Family::default(),
+            jobs: Family::default(),
+            jobs_unfinished: Gauge::default(),
+            job_shard_seconds: Histogram::new(exponential_buckets(1e-3, 2.0, 24)),
+            artifacts_expired: Counter::default(),
             connections: Gauge::default(),
             connections_refused: Counter::default(),
         };
@@ -142,6 +154,13 @@ impl Metrics {
         let help = "Same problem, different artifact: determinism broke";
         r.register("artifact_conflicts", help, self.artifact_conflicts.clone());
         r.register("plans", "Plans by what became of them", self.plans.clone());
+        r.register("jobs", "Precomputes by what became of them", self.jobs.clone());
+        let help = "Precomputes that are not done";
+        r.register("jobs_unfinished", help, self.jobs_unfinished.clone());
+        let help = "Time on a job thread, a shard";
+        r.register_with_unit("job_shard", help, Unit::Seconds, self.job_shard_seconds.clone());
+        let help = "Artifacts that nobody used for a whole term";
+        r.register("artifacts_expired", help, self.artifacts_expired.clone());
         r.register("connections", "Open connections", self.connections.clone());
         let help = "Connections dropped because too many were open";
         r.register("connections_refused", help, self.connections_refused.clone());

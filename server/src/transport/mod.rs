@@ -24,8 +24,6 @@ use crate::{
 
 pub(crate) use grpc::Draining;
 
-/// Domain of the reasons in `google.rpc.ErrorInfo`.
-const ERROR_DOMAIN: &str = "vbar";
 const GRPC_STATUS: &str = "grpc-status";
 const GRPC_DETAILS: &str = "grpc-status-details-bin";
 const REQUEST_ID: &str = "x-request-id";
@@ -199,12 +197,15 @@ mod tests {
             (Method::POST, "/v1/step", "Step"),
             (Method::GET, "/v1/step", "Step"),
             (Method::GET, "/v1/artifacts/00ff", "GetArtifact"),
+            (Method::GET, "/v1/artifacts", "ListArtifacts"),
+            (Method::GET, "/v1/artifacts/00ff:download", "DownloadArtifact"),
             (Method::GET, "/v1/operations", "ListOperations"),
             (Method::GET, "/v1/operations/00ff", "GetOperation"),
             (Method::HEAD, "/v1/operations/00ff", "GetOperation"),
             (Method::DELETE, "/v1/operations/00ff", "DeleteOperation"),
             (Method::POST, "/v1/operations/00ff:wait", "WaitOperation"),
             (Method::POST, "/v1/operations/00ff:cancel", "CancelOperation"),
+            (Method::GET, "/v1/operations/00ff:watch", "GetOperation"),
             (Method::GET, "/healthz", "probe"),
             (Method::POST, "/grpc.health.v1.Health/Check", "Health"),
             (Method::GET, "/v1/artifacts/00ff/more", "unknown"),

@@ -4,11 +4,13 @@ use std::{sync::Arc, time::Duration};
 
 use bytes::Bytes;
 use vbar_guidance::{Method, control::Infeasibility};
-use vbar_proto::{google::longrunning, v1};
+use vbar_proto::v1;
 
 use super::{
     Artifact, ArtifactId, Candidate, Claimed, Door, ElapsedAndState, Limits, Order, Parse, Path,
-    PlanVerdict, Planning, Problem, Provenance, Render, Step, count, types::BUILD_VERSION,
+    PlanVerdict, Planning, Problem, Provenance, Render, Step, count,
+    paging::{page_size, page_token},
+    types::BUILD_VERSION,
 };
 
 /// Which controller decides.
@@ -310,28 +312,6 @@ impl Parse for PlansCall {
     }
 }
 
-/// AIP-158: 0 means the default, more than the most is cut to it.
-fn page_size(given: i32, most: usize, path: Path<'_>, door: &mut Door) -> Option<usize> {
-    match usize::try_from(given) {
-        Ok(0) => Some(most),
-        Ok(size) => Some(size.min(most)),
-        Err(_) => door.refuse(path.field("page_size"), "at least 0", given),
-    }
-}
-
-/// A token is the id that the page before it ended with.
-#[allow(clippy::option_option, reason = "absent and wrong are different things here")]
-fn page_token(token: &str, path: Path<'_>, door: &mut Door) -> Option<Option<ArtifactId>> {
-    if token.is_empty() {
-        return Some(None);
-    }
-    ArtifactId::from_hex(token).map(Some).or_else(|| {
-        let shown: String = token.chars().take(100).collect();
-        let expected = "a token from an earlier page";
-        door.refuse(path.field("page_token"), expected, format!("{shown:?}"))
-    })
-}
-
 /// Answer of `ListPlans`.
 #[derive(Debug)]
 pub(crate) struct PlansAnswer {
@@ -364,233 +344,6 @@ impl Parse for ExportCall {
         let id = ArtifactId::parse(&message.plan_id, path.field("plan_id"), door);
         let order = Order::parse(message, path, door);
         Some(Self { id: id?, order: order? })
-    }
-}
-
-/// `Precompute`.
-#[derive(Debug)]
-pub(crate) struct PrecomputeCall {
-    pub(crate) problem: Problem,
-    pub(crate) validate_only: bool,
-}
-
-impl Parse for PrecomputeCall {
-    type Message = v1::PrecomputeRequest;
-
-    fn parse(message: &v1::PrecomputeRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
-        let problem = door.message(&message.problem, path.field("problem"));
-        // An operation is named by its problem, so that a repeated request finds it anyway; the
-        // request's own id needs no memory, only its form is checked (AIP-155).
-        let request_id = &message.request_id;
-        if !request_id.is_empty() && !is_uuid(request_id) {
-            let shown: String = request_id.chars().take(80).collect();
-            let path = path.field("request_id");
-            return door.refuse(path, "a UUID or nothing", format!("{shown:?}"));
-        }
-        Some(Self { problem: problem?, validate_only: message.validate_only })
-    }
-}
-
-fn is_uuid(text: &str) -> bool {
-    text.len() == 36
-        && text.bytes().enumerate().all(|(i, c)| match i {
-            8 | 13 | 18 | 23 => c == b'-',
-            _ => c.is_ascii_hexdigit(),
-        })
-}
-
-/// `GetArtifact`.
-#[derive(Debug)]
-pub(crate) struct ArtifactCall {
-    pub(crate) id: ArtifactId,
-}
-
-impl Parse for ArtifactCall {
-    type Message = v1::GetArtifactRequest;
-
-    fn parse(message: &v1::GetArtifactRequest, path: Path<'_>, door: &mut Door) -> Option<Self> {
-        ArtifactId::parse(&message.artifact_id, path.field("artifact_id"), door)
-            .map(|id| Self { id })
-    }
-}
-
-/// An artifact's summary.
-#[derive(Debug, Clone)]
-pub(crate) struct ArtifactAnswer {
-    pub(crate) id: ArtifactId,
-    pub(crate) artifact: Artifact,
-    pub(crate) provenance: Arc<Provenance>,
-    pub(crate) size_bytes: usize,
-}
-
-impl ArtifactAnswer {
-    fn summary(&self) -> v1::Artifact {
-        v1::Artifact {
-            artifact_id: self.provenance.artifact_id.clone(),
-            size_bytes: i64::try_from(self.size_bytes).unwrap_or(i64::MAX),
-            provenance: Some(self.provenance.render()),
-            summary: Some(self.artifact.render_summary()),
-        }
-    }
-}
-
-impl Render for ArtifactAnswer {
-    type Message = v1::GetArtifactResponse;
-
-    fn render(&self) -> v1::GetArtifactResponse {
-        v1::GetArtifactResponse { artifact: Some(self.summary()) }
-    }
-}
-
-/// An operation. It needs no record of its own: it is named by its artifact, and it is done as
-/// soon as the artifact is stored.
-#[derive(Debug)]
-pub(crate) enum OperationAnswer {
-    /// The artifact exists.
-    Made(ArtifactAnswer),
-    /// It cannot exist.
-    Infeasible { id: ArtifactId, problem: Problem, why: Arc<Infeasibility> },
-    /// The problem was only checked.
-    Validated { id: ArtifactId },
-}
-
-impl Render for OperationAnswer {
-    type Message = longrunning::Operation;
-
-    fn render(&self) -> longrunning::Operation {
-        use v1::precompute_response::Outcome;
-        let (artifact_id, outcome) = match self {
-            Self::Made(made) => {
-                (made.provenance.artifact_id.clone(), Some(Outcome::Artifact(made.summary())))
-            }
-            Self::Infeasible { id, problem, why } => {
-                (id.to_string(), Some(Outcome::Infeasible(problem.render_infeasible(why))))
-            }
-            Self::Validated { id } => (id.to_string(), None),
-        };
-        let done = outcome.is_some();
-        let metadata = v1::PrecomputeMetadata {
-            artifact_id: artifact_id.clone(),
-            fraction_done: if done { 1.0 } else { 0.0 },
-            phase: if done { "done" } else { "validated" }.to_owned(),
-        };
-        let response = outcome.map(|outcome| v1::PrecomputeResponse { outcome: Some(outcome) });
-        longrunning::Operation {
-            // A request that was only checked started nothing that could be asked for.
-            name: if done { format!("operations/{artifact_id}") } else { String::new() },
-            metadata: Some(any(&metadata)),
-            done,
-            result: response.map(|r| longrunning::operation::Result::Response(any(&r))),
-        }
-    }
-}
-
-fn any<M: prost::Name>(message: &M) -> prost_types::Any {
-    prost_types::Any { type_url: M::type_url(), value: message.encode_to_vec() }
-}
-
-/// Names an operation: of `GetOperation`, `WaitOperation`, `CancelOperation`, `DeleteOperation`.
-#[derive(Debug)]
-pub(crate) struct OperationName {
-    pub(crate) id: ArtifactId,
-}
-
-impl OperationName {
-    fn read(name: &str, path: Path<'_>, door: &mut Door) -> Option<Self> {
-        let id = name.strip_prefix("operations/").and_then(ArtifactId::from_hex);
-        id.map(|id| Self { id }).or_else(|| {
-            let shown: String = name.chars().take(100).collect();
-            let expected = "`operations/` and 64 lower-case hexadecimal digits";
-            door.refuse(path, expected, format!("{shown:?}"))
-        })
-    }
-}
-
-macro_rules! named_operation {
-    ($($message:ident),*) => {$(
-        impl From<&longrunning::$message> for NamedBy {
-            fn from(message: &longrunning::$message) -> Self {
-                Self(message.name.clone())
-            }
-        }
-    )*};
-}
-
-/// A request that names an operation and nothing else that matters.
-#[derive(Debug)]
-pub(crate) struct NamedBy(String);
-
-impl NamedBy {
-    /// By the id in a path.
-    pub(crate) fn operation(id: &str) -> Self {
-        Self(format!("operations/{id}"))
-    }
-}
-
-named_operation!(
-    GetOperationRequest,
-    WaitOperationRequest,
-    CancelOperationRequest,
-    DeleteOperationRequest
-);
-
-impl Parse for OperationName {
-    type Message = NamedBy;
-
-    fn parse(message: &NamedBy, path: Path<'_>, door: &mut Door) -> Option<Self> {
-        Self::read(&message.0, path.field("name"), door)
-    }
-}
-
-/// `ListOperations`.
-#[derive(Debug)]
-pub(crate) struct OperationsCall {
-    pub(crate) page_size: usize,
-    pub(crate) after: Option<ArtifactId>,
-}
-
-/// Operations on one page unless asked for fewer.
-const PAGE_SIZE: usize = 100;
-
-impl Parse for OperationsCall {
-    type Message = longrunning::ListOperationsRequest;
-
-    fn parse(message: &Self::Message, path: Path<'_>, door: &mut Door) -> Option<Self> {
-        let mut refuse = |name, expected: &str, got: &str| -> Option<()> {
-            let shown: String = got.chars().take(100).collect();
-            door.refuse(path.field(name), expected, format!("{shown:?}"))
-        };
-        let collection = match message.name.as_str() {
-            "" | "operations" => Some(()),
-            other => refuse("name", "`operations`", other),
-        };
-        let filter = match message.filter.as_str() {
-            "" => Some(()),
-            other => refuse("filter", "nothing: filters are not offered", other),
-        };
-        let after = page_token(&message.page_token, path, door);
-        let page_size = page_size(message.page_size, PAGE_SIZE, path, door);
-        collection?;
-        filter?;
-        Some(Self { page_size: page_size?, after: after? })
-    }
-}
-
-/// Answer of `ListOperations`.
-#[derive(Debug)]
-pub(crate) struct OperationsAnswer {
-    pub(crate) operations: Vec<OperationAnswer>,
-    pub(crate) next: Option<ArtifactId>,
-}
-
-impl Render for OperationsAnswer {
-    type Message = longrunning::ListOperationsResponse;
-
-    fn render(&self) -> Self::Message {
-        longrunning::ListOperationsResponse {
-            operations: self.operations.iter().map(Render::render).collect(),
-            next_page_token: self.next.map(|id| id.to_string()).unwrap_or_default(),
-        }
     }
 }
 

@@ -10,6 +10,7 @@ use vbar_guidance::{
     Budget, Method,
     control::{
         Certificate, Controller, Failure, Fault, Infeasibility, PrepareError, StepError,
+        abort_safe::{self, AbortSafe},
         disturbance_feedback::{self, DisturbanceFeedback},
         offline_sampling::OfflineSampling,
         variable_horizon::VariableHorizon,
@@ -38,6 +39,8 @@ pub(super) trait Wired:
     const METHOD: Method;
     /// What `ComputePlan` means for it.
     const PLANNING: Planning;
+    /// Whether measurements may say that thrusters have failed.
+    const SEES_FAILURES: bool = false;
 
     /// Our own encoding of the parsed values; its digest names the problem.
     fn canonical_bytes(problem: &Self::Problem) -> Vec<u8>;
@@ -60,6 +63,11 @@ pub(super) trait Wired:
     fn render_summary(artifact: &Self::Artifact) -> v1::artifact::Summary;
     /// The artifact as a plan that can be kept and flown, if that is what it is.
     fn as_plan(_artifact: &Self::Artifact) -> Option<&disturbance_feedback::Plan> {
+        None
+    }
+
+    /// The artifact as one that safety reports are made with, if that is what it is.
+    fn as_abort_safe(_artifact: &Self::Artifact) -> Option<&abort_safe::Artifact> {
         None
     }
 
@@ -158,11 +166,12 @@ pub(crate) struct SolverWork {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum VerdictKind {
     Command,
+    Abort,
     Arrived,
     Infeasible,
 }
 
-const METHODS: &str = "one of variable_horizon, disturbance_feedback, offline_sampling";
+const METHODS: &str = "one of variable_horizon, disturbance_feedback, abort_safe, offline_sampling";
 
 /// A mission.
 #[derive(Debug, Clone)]
@@ -180,11 +189,11 @@ impl Parse for Problem {
             Some(Message::DisturbanceFeedback(problem)) => {
                 asked::<DisturbanceFeedback>(problem, path.field("disturbance_feedback"), door)
             }
+            Some(Message::AbortSafe(problem)) => {
+                asked::<AbortSafe>(problem, path.field("abort_safe"), door)
+            }
             Some(Message::OfflineSampling(problem)) => {
                 asked::<OfflineSampling>(problem, path.field("offline_sampling"), door)
-            }
-            Some(Message::AbortSafe(_)) => {
-                door.refuse(path, METHODS, "abort_safe, which this server does not serve yet")
             }
         }
     }
@@ -195,6 +204,7 @@ fn wired(method: Method) -> &'static dyn AnyMethod {
     match method {
         Method::VariableHorizon => &Of::<VariableHorizon>(PhantomData),
         Method::DisturbanceFeedback => &Of::<DisturbanceFeedback>(PhantomData),
+        Method::AbortSafe => &Of::<AbortSafe>(PhantomData),
         Method::OfflineSampling => &Of::<OfflineSampling>(PhantomData),
     }
 }
@@ -213,8 +223,8 @@ impl Problem {
         Some(match message.method.as_ref()? {
             Message::VariableHorizon(_) => VariableHorizon::PLANNING,
             Message::DisturbanceFeedback(_) => DisturbanceFeedback::PLANNING,
+            Message::AbortSafe(_) => AbortSafe::PLANNING,
             Message::OfflineSampling(_) => OfflineSampling::PLANNING,
-            Message::AbortSafe(_) => return None,
         })
     }
 
@@ -323,6 +333,16 @@ impl Artifact {
     /// Whether it is itself a plan, which can be kept and flown.
     pub(crate) fn is_plan(&self) -> bool {
         self.0.as_plan().is_some()
+    }
+
+    /// What safety reports are made with; `None` for other methods.
+    pub(super) fn as_abort_safe(&self) -> Option<&abort_safe::Artifact> {
+        self.0.as_abort_safe()
+    }
+
+    /// The plan that it is; `None` for what is no plan.
+    pub(super) fn as_plan(&self) -> Option<&disturbance_feedback::Plan> {
+        self.0.as_plan()
     }
 
     /// Writes a plan as a document; `None` for what is no plan.
@@ -496,6 +516,7 @@ trait AnyArtifact: fmt::Debug + Send + Sync {
         budget: Budget<'_>,
     ) -> Result<PlanVerdict, StepError>;
     fn as_plan(&self) -> Option<&disturbance_feedback::Plan>;
+    fn as_abort_safe(&self) -> Option<&abort_safe::Artifact>;
     fn render_summary(&self) -> v1::artifact::Summary;
 }
 
@@ -506,6 +527,16 @@ impl<M: Wired> Made<M> {
     fn artifact(made: M::Artifact) -> Artifact {
         Artifact(Arc::new(Self(made)))
     }
+}
+
+/// A method that does not know of failures must not ignore one.
+fn understood<M: Wired>(measured: &ElapsedAndState) -> Result<(), StepError> {
+    if M::SEES_FAILURES || measured.working.is_none() {
+        return Ok(());
+    }
+    let expected = format!("nothing: {} does not know of failures", M::METHOD.name());
+    let fault = Fault::new("working_thrusters", expected, "thrusters");
+    Err(StepError::Measurement(vec![fault]))
 }
 
 impl<M: Wired> fmt::Debug for Made<M> {
@@ -541,8 +572,9 @@ impl<M: Wired> AnyArtifact for Made<M> {
         let Some(Between(state)) = state.downcast_ref::<Between<M>>() else {
             return Err(StepError::State("it belongs to another method".to_owned()));
         };
-        let measurement =
-            M::measurement(&self.0, measured).map_err(|fault| StepError::Measurement(vec![fault]))?;
+        understood::<M>(measured)?;
+        let measurement = M::measurement(&self.0, measured)
+            .map_err(|fault| StepError::Measurement(vec![fault]))?;
         let answer = M::step(&self.0, state, &measurement, budget)?;
         Ok(Box::new(Decided { by: self, answer }))
     }
@@ -552,11 +584,16 @@ impl<M: Wired> AnyArtifact for Made<M> {
         initial: Option<&ElapsedAndState>,
         budget: Budget<'_>,
     ) -> Result<PlanVerdict, StepError> {
+        initial.map_or(Ok(()), understood::<M>)?;
         M::plan(&self.0, initial, budget)
     }
 
     fn as_plan(&self) -> Option<&disturbance_feedback::Plan> {
         M::as_plan(&self.0)
+    }
+
+    fn as_abort_safe(&self) -> Option<&abort_safe::Artifact> {
+        M::as_abort_safe(&self.0)
     }
 
     fn render_summary(&self) -> v1::artifact::Summary {

@@ -4,30 +4,46 @@
 //! Nothing is repaired here. A value is taken as it is or refused; where a message leaves a choice
 //! to the server, the `.proto` file says which one is made.
 
+mod abort_safe;
+mod artifacts;
 mod calls;
 mod controller_state;
 mod disturbance_feedback;
 mod export;
 mod methods;
 mod offline_sampling;
+mod operations;
 mod orbits;
+mod paging;
 mod types;
 mod variable_horizon;
 
 use std::fmt;
 
+use serde::{Deserialize, Serialize};
+
+pub(crate) use abort_safe::{ReportAnswer, ReportCall, ReportFault};
+pub(crate) use artifacts::{
+    ArtifactAnswer, ArtifactCall, ArtifactsAnswer, ArtifactsCall, DownloadAnswer, DownloadCall,
+    StoredArtifact,
+};
 pub(crate) use calls::{
-    ArtifactAnswer, ArtifactCall, Controller, DecidedStep, ExportCall, InfoAnswer, InfoCall,
-    KeptPlanAnswer, KeptPlanCall, NamedBy, OperationAnswer, OperationName, OperationsAnswer,
-    OperationsCall, PlanAnswer, PlanCall, PlanResult, PlansAnswer, PlansCall, PrecomputeCall,
-    StepAnswer, StepCall, StreamCall, UploadAnswer, UploadCall,
+    Controller, DecidedStep, ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer, KeptPlanCall,
+    PlanAnswer, PlanCall, PlanResult, PlansAnswer, PlansCall, StepAnswer, StepCall, StreamCall,
+    UploadAnswer, UploadCall,
 };
 pub(crate) use controller_state::{ControllerState, StateFault};
 pub(crate) use disturbance_feedback::Claimed;
 pub(crate) use export::{Document, Missing, OcmBurn, OcmFault, Order, read_ocm_burns};
 use methods::Wired;
 pub(crate) use methods::{
-    Artifact, Candidate, PlanVerdict, Planning, Problem, SolverWork, State, Step, VerdictKind,
+    Artifact, Candidate, PlanVerdict, Planning, Problem, Shard, SolverWork, State, Step,
+    VerdictKind,
+};
+pub(crate) use operations::{
+    ERROR_DOMAIN, Failure, NamedBy, NoArtifact, OperationAnswer, OperationFilter, OperationName,
+    OperationOutcome, OperationsAnswer, OperationsCall, PrecomputeCall, Progress, Standing,
+    WaitCall, problem_again,
 };
 pub(crate) use types::{ArtifactId, ElapsedAndState, Provenance};
 pub(crate) use vbar_guidance::control::disturbance_feedback::INSTANTS_MAX as PLAN_INSTANTS_MAX;
@@ -107,7 +123,8 @@ pub(crate) fn parse<T: Parse>(message: &T::Message, limits: &Limits) -> Result<T
 }
 
 /// One fault of a request.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct Violation {
     /// Where: field names as in the `.proto` files, joined by dots, with indices in brackets.
     pub(crate) path: String,

@@ -6,6 +6,7 @@ use nalgebra::{DMatrix, DVector, Vector3};
 use vbar_guidance::{
     control::{self, Certificate, Claim, ConstraintFamily, Infeasibility},
     frames::{InFrame, LvlhCcsds, RTN_FROM_LVLH_CCSDS, RelativeState, Rtn},
+    mission::{THRUSTERS_MAX, ThrustMode},
     sets::Polytope,
     units::Seconds,
 };
@@ -98,6 +99,8 @@ pub(crate) struct ElapsedAndState {
     pub(crate) state: MeasuredState,
     /// Time since the mission's start.
     pub(crate) elapsed: Option<Seconds>,
+    /// Thrusters that work, if it is said.
+    pub(crate) working: Option<ThrustMode>,
 }
 
 /// The measured state.
@@ -130,8 +133,40 @@ impl Parse for ElapsedAndState {
             None => Some(None),
             Some(seconds) => not_negative(seconds, path.field("elapsed_s"), door).map(Some),
         };
-        Some(Self { state: state?, elapsed: elapsed?.map(Seconds::from_seconds) })
+        let working = message.working_thrusters.as_ref().map_or(Some(None), |working| {
+            working_thrusters(working, THRUSTERS_MAX, path.field("working_thrusters"), door)
+                .map(Some)
+        });
+        Some(Self {
+            state: state?,
+            elapsed: elapsed?.map(Seconds::from_seconds),
+            working: working?,
+        })
     }
+}
+
+/// Some of `count` thrusters.
+pub(super) fn working_thrusters(
+    message: &v1::WorkingThrusters,
+    count: usize,
+    path: Path<'_>,
+    door: &mut Door,
+) -> Option<ThrustMode> {
+    let path = path.field("indices");
+    let (mut bits, mut least) = (0, 0);
+    for (i, &index) in message.indices.iter().enumerate() {
+        match usize::try_from(index) {
+            Ok(thruster) if (least..count).contains(&thruster) => {
+                bits |= 1 << thruster;
+                least = thruster + 1;
+            }
+            _ => {
+                let expected = format!("thrusters from 0 to {}, increasing", count - 1);
+                return door.refuse(path.index(i), expected, index);
+            }
+        }
+    }
+    Some(ThrustMode::from_bits(bits))
 }
 
 pub(super) fn relative_state(
@@ -167,6 +202,19 @@ impl Axes {
                 turned.components
             }
         }
+    }
+
+    /// A quadratic form of one vector, or of position and velocity, along RTN. The axes only change
+    /// places and signs, so no digit is lost.
+    pub(super) fn form_to_rtn(self, form: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut turn = DMatrix::zeros(form.nrows(), form.nrows());
+        for first in (0..form.nrows()).step_by(3) {
+            for axis in 0..3 {
+                let turned = self.to_rtn(Vector3::ith(axis, 1.0));
+                (0..3).for_each(|i| turn[(first + i, first + axis)] = turned[i]);
+            }
+        }
+        &turn * form * turn.transpose()
     }
 
     /// Half widths along RTN of a box given along these axes: the axes only change places.

@@ -170,3 +170,67 @@ pub(crate) fn predicted_after(answer: &v1::StepResponse, steps: usize, elapsed_s
         "elapsedS": elapsed_s,
     })
 }
+
+/// The mission to the space station of [AguilarMarsillach2022, sec. VI]: approach ellipsoid,
+/// keep-out sphere, 20 m box, target. Thresholds are not the paper's, and the safety horizon of the
+/// passive phases is as long as a test can afford.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn station() -> Value {
+    let passive = |region: Value, within: f64| {
+        json!({
+            "passive": { "watch": { "region": region, "horizonSteps": 60 } },
+            "weights": {
+                "stage": { "identityTimes": 1e-6 },
+                "input": { "identityTimes": 0.013 },
+                "terminal": { "identityTimes": 1e-4 },
+            },
+            "advanceWithinM": within,
+        })
+    };
+    let near = json!({
+        "stage": { "identityTimes": 1e-3 },
+        "input": { "identityTimes": 1e-6 },
+        "terminal": { "identityTimes": 1e-3 },
+    });
+    json!({ "abortSafe": {
+        "orbit": { "elements": {
+            "semiMajorAxisM": 6_726_270.0, "eccentricity": 0.0, "trueAnomalyDeg": 0.0,
+        } },
+        "massKg": 4000.0,
+        "sampleTimeS": 30.0,
+        "frame": "FRAME_RTN",
+        "thrusters": { "cubeCorners": { "forceMaxN": 20.0 } },
+        "phases": [
+            passive(json!({ "semiAxes": { "semiAxesM": [1000.0, 2000.0, 1000.0] } }), 200.0),
+            passive(json!({ "radiusM": 100.0 }), 150.0),
+            {
+                "active": {
+                    "watch": {
+                        "region": { "halfWidths": { "halfWidthsM": [20.0, 20.0, 20.0] } },
+                        "speedMaxMS": 6.0,
+                        "horizonSteps": 46,
+                    },
+                    "modes": { "preset": "FAILURE_MODE_PRESET_SINGLE_THRUSTERS" },
+                },
+                "weights": near,
+                "advanceWithinM": 30.0,
+            },
+            { "nothingAvoided": {}, "weights": near },
+        ],
+        "predictionHorizon": 30,
+        "fallback": "ABORT_SAFE_FALLBACK_SOFTEN",
+        "arrivalDistanceM": 5.0,
+        "fastestApproachMS": 5.0,
+        "stepsMax": 2000,
+    } })
+}
+
+/// At rest relative to the station, so far along its orbit.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn at_rest(along_track_m: f64) -> Value {
+    json!({ "relative": {
+        "frame": "FRAME_RTN",
+        "positionM": [0.0, along_track_m, 0.0],
+        "velocityMS": [0.0, 0.0, 0.0],
+    } })
+}

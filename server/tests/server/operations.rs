@@ -1,10 +1,13 @@
-//! Long-running operations and artifacts.
+//! Long-running operations.
+
+use std::time::{Duration, Instant};
 
 use ::http::Method;
 use bytes::Bytes;
 use prost::Message as _;
 use serde_json::{Value, json};
 use tonic::Code;
+use tonic_types::StatusExt as _;
 use vbar_proto::{
     google::longrunning::{
         CancelOperationRequest, DeleteOperationRequest, GetOperationRequest, ListOperationsRequest,
@@ -12,19 +15,34 @@ use vbar_proto::{
     },
     v1,
 };
-use vbar_server::{Config, StoreLocation};
+use vbar_server::{Config, Node, StartError, StoreLocation};
 
 use crate::{
     missions,
-    support::{Server, detail, server, server_with, step_request},
+    support::{Answer, Server, detail, server, server_with},
 };
 
-async fn precompute(server: &Server, problem: &Value) -> Operation {
+/// Starts a precompute.
+pub(crate) async fn begin(server: &Server, problem: &Value) -> Operation {
     let request: v1::PrecomputeRequest = missions::message(json!({ "problem": problem }));
     server.grpc().await.precompute(request).await.unwrap().into_inner()
 }
 
-fn artifact(operation: &Operation) -> v1::Artifact {
+/// Starts a precompute and waits for its end.
+pub(crate) async fn precompute(server: &Server, problem: &Value) -> Operation {
+    let begun = begin(server, problem).await;
+    if begun.done { begun } else { wait(server, &begun.name).await }
+}
+
+async fn wait(server: &Server, name: &str) -> Operation {
+    let mut client = OperationsClient::new(server.channel().await);
+    let request = WaitOperationRequest { name: name.to_owned(), timeout: None };
+    let operation = client.wait_operation(request).await.unwrap().into_inner();
+    assert!(operation.done, "{operation:?}");
+    operation
+}
+
+pub(crate) fn artifact(operation: &Operation) -> v1::Artifact {
     let Some(operation::Result::Response(response)) = &operation.result else {
         panic!("{operation:?}");
     };
@@ -36,6 +54,30 @@ fn artifact(operation: &Operation) -> v1::Artifact {
     }
 }
 
+fn metadata(operation: &Operation) -> v1::PrecomputeMetadata {
+    let packed = operation.metadata.as_ref().expect("there is always metadata");
+    v1::PrecomputeMetadata::decode(packed.value.as_slice()).unwrap()
+}
+
+/// Problems that differ in nothing that matters.
+pub(crate) fn numbered(number: u32) -> Value {
+    let mut problem = missions::double_integrator();
+    problem["variableHorizon"]["fuelWeight"] = (f64::from(number) + 1.0).into();
+    problem
+}
+
+/// A plan of so many burns with so little thrust that it takes many seconds.
+fn slow() -> Value {
+    let mut problem = missions::prisma_6000_s(0.2);
+    problem["disturbanceFeedback"]["instants"]["equalTime"]["count"] = 64.into();
+    problem
+}
+
+/// One thread for jobs, and no wait for their end.
+fn impatient() -> Config {
+    Config { job_threads: 1, precompute_wait: Duration::ZERO, ..Config::default() }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn operation_of_a_precompute_can_be_asked_for_everywhere() {
     let server = server().await;
@@ -43,60 +85,92 @@ async fn operation_of_a_precompute_can_be_asked_for_everywhere() {
     assert!(made.done);
     let artifact = artifact(&made);
     assert_eq!(made.name, format!("operations/{}", artifact.artifact_id));
+    let progress = metadata(&made);
+    assert_eq!(progress.state(), v1::PrecomputeState::Succeeded);
+    assert_eq!((progress.phase.as_str(), progress.fraction_done), ("done", 1.0));
+    assert_eq!((progress.shards_done, progress.attempts), (progress.shards_total, 1));
+    let time = |time: Option<prost_types::Timestamp>| time.map(|t| (t.seconds, t.nanos)).unwrap();
+    assert!(time(progress.create_time) <= time(progress.start_time));
+    assert!(time(progress.start_time) <= time(progress.end_time));
+    assert!(time(artifact.expire_time) > time(progress.end_time));
     // The same problem is the same operation.
     assert_eq!(precompute(&server, &missions::double_integrator()).await, made);
     let mut client = OperationsClient::new(server.channel().await);
     let name = made.name.clone();
     let got = client.get_operation(GetOperationRequest { name: name.clone() }).await.unwrap();
     assert_eq!(got.into_inner(), made);
-    let wait = WaitOperationRequest { name: name.clone(), timeout: None };
-    assert_eq!(client.wait_operation(wait).await.unwrap().into_inner(), made);
+    assert_eq!(wait(&server, &name).await, made);
     let list = client.list_operations(ListOperationsRequest::default()).await.unwrap();
-    assert_eq!(list.into_inner().operations, [made]);
-    assert!(client.cancel_operation(CancelOperationRequest { name: name.clone() }).await.is_ok());
-    let deleted = client.delete_operation(DeleteOperationRequest { name: name.clone() }).await;
-    assert_eq!(deleted.unwrap_err().code(), Code::Unimplemented);
-    let got = client.get_operation(GetOperationRequest { name }).await;
-    assert!(got.is_ok(), "delete must not have deleted");
+    assert_eq!(list.into_inner().operations, std::slice::from_ref(&made));
+    // It is done: nothing is left to stop.
+    client.cancel_operation(CancelOperationRequest { name: name.clone() }).await.unwrap();
+    assert_eq!(wait(&server, &name).await, made);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn operation_deleted_is_gone_and_its_artifact_stays() {
+    let server = server().await;
+    let made = precompute(&server, &missions::double_integrator()).await;
+    let mut client = OperationsClient::new(server.channel().await);
+    let name = made.name.clone();
+    client.delete_operation(DeleteOperationRequest { name: name.clone() }).await.unwrap();
+    let got = client.get_operation(GetOperationRequest { name: name.clone() }).await;
+    assert_eq!(got.unwrap_err().code(), Code::NotFound);
+    let again = client.delete_operation(DeleteOperationRequest { name }).await;
+    assert_eq!(again.unwrap_err().code(), Code::NotFound);
+    let request = v1::GetArtifactRequest { artifact_id: artifact(&made).artifact_id };
+    assert!(server.grpc().await.get_artifact(request).await.is_ok());
+    // Nothing is computed again.
+    assert_eq!(artifact(&begin(&server, &missions::double_integrator()).await), artifact(&made));
+    assert_eq!(computed(&server).await, 1.0);
+}
+
+/// Artifacts computed by this node.
+async fn computed(server: &Server) -> f64 {
+    server.metric("vbar_artifact_lookups_total{outcome=\"computed\"}").await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn operation_over_http_is_the_same() {
     let server = server().await;
     let request = json!({ "problem": missions::double_integrator() });
-    let made = server.post("/v1/precompute", &request).await;
-    assert_eq!(made.status, 200, "{}", made.text());
-    let made = made.json();
-    assert_eq!(made["done"], true);
-    let name = made["name"].as_str().unwrap();
-    assert_eq!(server.get(&format!("/v1/{name}")).await.json(), made);
     let post = async |path: String| server.http(Method::POST, &path, &[], Bytes::new()).await;
-    assert_eq!(post(format!("/v1/{name}:wait")).await.json(), made);
+    let begun = server.post("/v1/precompute", &request).await;
+    assert_eq!(begun.status, 200, "{}", begun.text());
+    let begun = begun.json();
+    let name = begun["name"].as_str().unwrap();
+    let made = post(format!("/v1/{name}:wait")).await.json();
+    assert_eq!(made["done"], true);
+    assert_eq!(server.get(&format!("/v1/{name}")).await.json(), made);
     assert_eq!(post(format!("/v1/{name}:cancel")).await.json(), json!({}));
     let wait = json!({ "timeout": "1.5s" });
     assert_eq!(server.post(&format!("/v1/{name}:wait"), &wait).await.json(), made);
+    let backwards = json!({ "timeout": "-1.5s" });
+    assert_eq!(server.post(&format!("/v1/{name}:wait"), &backwards).await.status, 400);
     let list = server.get("/v1/operations").await.json();
     assert_eq!(list["operations"], json!([made]));
     let id = name.strip_prefix("operations/").unwrap();
     let artifact = server.get(&format!("/v1/artifacts/{id}")).await.json();
     assert_eq!(artifact["artifact"], made["response"]["artifact"]);
     assert_eq!(artifact["artifact"]["provenance"]["artifactId"], id);
+    let path = format!("/v1/{name}");
+    let delete = async || server.http(Method::DELETE, &path, &[], Bytes::new()).await;
+    assert_eq!(delete().await.json(), json!({}));
+    assert_eq!(delete().await.status, 404);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn operations_are_paged() {
+async fn operations_are_paged_and_filtered() {
     let server = server().await;
     let mut ids = Vec::new();
-    for weight in [1.0, 2.0, 3.0] {
-        let mut problem = missions::double_integrator();
-        problem["variableHorizon"]["fuelWeight"] = weight.into();
-        ids.push(artifact(&precompute(&server, &problem).await).artifact_id);
+    for number in 0..3 {
+        ids.push(artifact(&precompute(&server, &numbered(number)).await).artifact_id);
     }
     ids.sort();
     let mut seen = Vec::new();
     let mut token = String::new();
     loop {
-        let path = format!("/v1/operations?pageSize=1&pageToken={token}");
+        let path = format!("/v1/operations?pageSize=1&pageToken={token}&filter=state%3DSUCCEEDED");
         let page = server.get(&path).await.json();
         let operations = page["operations"].as_array().unwrap();
         assert!(operations.len() <= 1);
@@ -107,28 +181,105 @@ async fn operations_are_paged() {
         }
     }
     assert_eq!(seen, ids);
+    let failed = server.get("/v1/operations?filter=done%3Dtrue+AND+state%3DFAILED").await.json();
+    assert_eq!(failed["operations"], json!([]));
+    let refused = server.get("/v1/operations?filter=colour%3Dred").await;
+    assert_eq!(refused.status, 400);
+    assert!(refused.text().contains("state=QUEUED"), "{}", refused.text());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn artifact_unknown_is_not_found_and_malformed_is_refused() {
+async fn operation_slow_is_answered_at_once_watched_and_cancelled() {
+    let server = server_with(impatient()).await;
+    let asked = Instant::now();
+    let begun = begin(&server, &slow()).await;
+    assert!(!begun.done, "after {:?}: {begun:?}", asked.elapsed());
+    let queued = begin(&server, &missions::double_integrator()).await;
+    assert_eq!(metadata(&queued).state(), v1::PrecomputeState::Queued);
+    let mut client = OperationsClient::new(server.channel().await);
+    // A wait ends at its own time.
+    let timeout = Some(prost_types::Duration { seconds: 0, nanos: 200_000_000 });
+    let request = WaitOperationRequest { name: begun.name.clone(), timeout };
+    let waited = client.wait_operation(request).await.unwrap().into_inner();
+    assert!(!waited.done);
+    let progress = metadata(&waited);
+    assert_eq!(progress.state(), v1::PrecomputeState::Running);
+    assert_eq!((progress.phase.as_str(), progress.attempts), ("computing", 1));
+    assert!(progress.start_time.is_some() && progress.end_time.is_none());
+    let list = ListOperationsRequest { filter: "state=RUNNING".into(), ..Default::default() };
+    let list = client.list_operations(list).await.unwrap().into_inner();
+    assert_eq!(list.operations.len(), 1);
+    // What runs is not forgotten.
+    let delete = DeleteOperationRequest { name: begun.name.clone() };
+    let refused = client.delete_operation(delete).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    // Steps have threads of their own.
+    assert_eq!(server.get("/v1/info").await.status, 200);
+
+    let watch = async { server.get(&format!("/v1/{}:watch", begun.name)).await };
+    let cancel = async {
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        let request = CancelOperationRequest { name: begun.name.clone() };
+        let mut client = client.clone();
+        client.cancel_operation(request).await.unwrap();
+    };
+    let (watched, ()) = tokio::join!(watch, cancel);
+    check_events(&watched);
+    let cancelled = wait(&server, &begun.name).await;
+    let Some(operation::Result::Error(error)) = &cancelled.result else { panic!("{cancelled:?}") };
+    assert_eq!(error.code, Code::Cancelled as i32);
+    assert!(error.get_error_details().error_info().is_some());
+    assert_eq!(server.metric("vbar_jobs_total{outcome=\"cancelled\"}").await, 1.0);
+    // The thread is free again for the one that waited.
+    assert!(wait(&server, &queued.name).await.done);
+}
+
+/// Progress first, the end last, each a whole operation.
+fn check_events(answer: &Answer) {
+    assert_eq!(answer.headers["content-type"], "text/event-stream");
+    let events: Vec<(&str, Value)> = answer
+        .text()
+        .split("\n\n")
+        .filter(|event| event.starts_with("event:"))
+        .map(|event| {
+            let (name, data) = event.split_once('\n').unwrap();
+            let data = data.strip_prefix("data:").unwrap().trim_start();
+            (name.trim_start_matches("event:").trim(), serde_json::from_str(data).unwrap())
+        })
+        .collect();
+    let (first, last) = (events.first().unwrap(), events.last().unwrap());
+    assert_eq!((first.0, &first.1["done"]), ("progress", &json!(false)));
+    assert_eq!((last.0, &last.1["done"]), ("done", &json!(true)));
+    assert_eq!(last.1["error"]["code"], 1);
+    let reason = detail(&last.1["error"], "ErrorInfo").unwrap()["reason"].clone();
+    assert_eq!(reason, "CANCELLED");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn precomputes_of_one_problem_at_once_are_computed_once() {
     let server = server().await;
-    let unknown = "ab".repeat(32);
-    let answer = server.get(&format!("/v1/artifacts/{unknown}")).await;
-    assert_eq!(answer.status, 404);
-    assert_eq!(detail(&answer.json(), "ErrorInfo").unwrap()["reason"], "ARTIFACT_UNKNOWN");
-    assert_eq!(server.get(&format!("/v1/operations/{unknown}")).await.status, 404);
-    for malformed in ["ab", "AB", "zz"] {
-        let malformed = malformed.repeat(32)[..63].to_owned();
-        assert_eq!(server.get(&format!("/v1/artifacts/{malformed}")).await.status, 400);
-    }
-    let mut client = server.grpc().await;
-    let request = v1::GetArtifactRequest { artifact_id: unknown };
-    assert_eq!(client.get_artifact(request).await.unwrap_err().code(), Code::NotFound);
-    let step = step_request(
-        ("artifactId", "cd".repeat(32).into()),
-        json!({ "linear": { "components": [1.0, 0.0] } }),
-    );
-    assert_eq!(client.step(step).await.unwrap_err().code(), Code::NotFound);
+    let problem = missions::envisat();
+    let calls = (0..8).map(|_| precompute(&server, &problem));
+    let made = futures_util::future::join_all(calls).await;
+    assert!(made.iter().all(|operation| artifact(operation) == artifact(&made[0])));
+    assert_eq!(computed(&server).await, 1.0);
+    assert_eq!(server.metric("vbar_jobs_total{outcome=\"accepted\"}").await, 1.0);
+    assert_eq!(server.metric("vbar_jobs_total{outcome=\"joined\"}").await, 7.0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn precompute_request_id_names_one_problem() {
+    let server = server().await;
+    let ask = async |number| {
+        let request_id = "7F1C2B0A-9A40-4a53-8d5e-0d6a3b0c1d2e";
+        let request = json!({ "problem": numbered(number), "requestId": request_id });
+        server.post("/v1/precompute", &request).await
+    };
+    let first = ask(1).await.json();
+    assert_eq!(ask(1).await.json()["name"], first["name"]);
+    let refused = ask(2).await;
+    assert_eq!(refused.status, 409, "{}", refused.text());
+    assert_eq!(detail(&refused.json(), "ErrorInfo").unwrap()["reason"], "REQUEST_ID_REUSED");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -140,35 +291,64 @@ async fn precompute_validate_only_keeps_nothing() {
     let id = checked.json()["metadata"]["artifactId"].as_str().unwrap().to_owned();
     assert_eq!(checked.json()["done"], false);
     assert_eq!(server.get(&format!("/v1/artifacts/{id}")).await.status, 404);
+    assert_eq!(server.get("/v1/operations").await.json()["operations"], json!([]));
     let request = json!({ "problem": missions::double_integrator(), "requestId": "not a uuid" });
     assert_eq!(server.post("/v1/precompute", &request).await.status, 400);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn artifact_in_a_directory_survives_a_restart_and_damage_is_named() {
-    let folder = tempfile::tempdir().unwrap();
-    let config =
-        Config { store: StoreLocation::Directory(folder.path().to_owned()), ..Config::default() };
-    let first = server_with(config.clone()).await;
-    let made = artifact(&precompute(&first, &missions::double_integrator()).await);
-    first.node.shutdown().await;
-    let second = server_with(config.clone()).await;
-    let path = format!("/v1/artifacts/{}", made.artifact_id);
-    let found = second.get(&path).await.json();
-    assert_eq!(found["artifact"]["provenance"]["contentSha256"], {
-        made.provenance.as_ref().unwrap().content_sha256.as_str()
+async fn operations_have_limits() {
+    let config = Config { jobs_unfinished_max: 1, watchers_max: 0, ..impatient() };
+    assert!(matches!(Node::start(config.clone()).await, Err(StartError::Config(_))));
+    let server = server_with(Config { watchers_max: 1, ..config }).await;
+    let begun = begin(&server, &slow()).await;
+    let request = json!({ "problem": missions::double_integrator() });
+    let refused = server.post("/v1/precompute", &request).await;
+    assert_eq!(refused.status, 429, "{}", refused.text());
+    assert_eq!(detail(&refused.json(), "ErrorInfo").unwrap()["reason"], "QUEUE_FULL");
+    assert!(refused.headers["retry-after"].parse::<u32>().unwrap() >= 1);
+    // The same problem joins what is there.
+    assert_eq!(begin(&server, &slow()).await.name, begun.name);
+    let path = format!("/v1/{}:watch", begun.name);
+    let (first, second) = tokio::join!(server.get(&path), async {
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        let second = server.get(&path).await;
+        let cancel = format!("/v1/{}:cancel", begun.name);
+        server.http(Method::POST, &cancel, &[], Bytes::new()).await;
+        second
     });
-    second.node.shutdown().await;
-    let file = folder.path().join("v1").join(&made.artifact_id[..2]).join(&made.artifact_id);
-    let mut bytes = std::fs::read(&file).unwrap();
-    let middle = bytes.len() / 2;
-    bytes[middle] ^= 1;
-    std::fs::write(&file, bytes).unwrap();
-    let third = server_with(config).await;
-    let damaged = third.get(&path).await;
-    assert_eq!(damaged.status, 500);
-    let error = damaged.json();
-    assert_eq!(error["code"], 15);
-    assert_eq!(detail(&error, "ErrorInfo").unwrap()["reason"], "ARTIFACT_DAMAGED");
-    assert!(error["message"].as_str().unwrap().contains(&made.artifact_id));
+    check_events(&first);
+    assert_eq!(second.status, 429, "{}", second.text());
+    let unknown = format!("/v1/operations/{}:watch", "ab".repeat(32));
+    assert_eq!(server.get(&unknown).await.status, 404);
+    assert_eq!(server.http(Method::POST, &path, &[], Bytes::new()).await.status, 405);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn operations_survive_their_node() {
+    const PROBLEMS: u32 = 12;
+    let folder = tempfile::tempdir().unwrap();
+    let store = StoreLocation::Directory(folder.path().to_owned());
+    let config = Config { store, ..impatient() };
+    let first = server_with(config.clone()).await;
+    let slow = begin(&first, &slow()).await;
+    let mut names = Vec::new();
+    for number in 0..PROBLEMS {
+        names.push(begin(&first, &numbered(number)).await.name);
+    }
+    // One directory, one node.
+    let Err(StartError::Store(fault)) = Node::start(config.clone()).await else {
+        panic!("two nodes on one directory")
+    };
+    assert!(fault.contains("another process"), "{fault}");
+    first.node.shutdown().await;
+    let second = server_with(config).await;
+    let resumed = second.metric("vbar_jobs_total{outcome=\"resumed\"}").await;
+    assert!(resumed >= 1.0, "{resumed} operations were under way");
+    let cancel = format!("/v1/{}:cancel", slow.name);
+    assert_eq!(second.http(Method::POST, &cancel, &[], Bytes::new()).await.status, 200);
+    for name in names {
+        let made = wait(&second, &name).await;
+        assert_eq!(format!("operations/{}", artifact(&made).artifact_id), name);
+    }
 }

@@ -1,6 +1,6 @@
 //! A node, a gRPC client and a plain HTTP client.
 
-use std::{collections::BTreeMap, net::SocketAddr, sync::Arc};
+use std::{collections::BTreeMap, net::SocketAddr, sync::Arc, time::Duration};
 
 use ::http::{Method, Request, StatusCode};
 use bytes::Bytes;
@@ -27,9 +27,15 @@ pub(crate) struct Server {
     pub(crate) address: SocketAddr,
 }
 
-/// A node as it is by default.
+/// A node as it is by default, but that it waits for what it precomputes, however slow the machine
+/// is.
 pub(crate) async fn server() -> Server {
-    server_with(Config::default()).await
+    server_with(patient()).await
+}
+
+/// Its configuration.
+pub(crate) fn patient() -> Config {
+    Config { precompute_wait: Duration::from_secs(50), ..Config::default() }
 }
 
 /// A node with a configuration.

@@ -2,6 +2,7 @@
 //!
 //! A run depends on the seed and on its own number, never on how many others fly beside it.
 
+pub(crate) mod abort;
 pub(crate) mod crew;
 pub(crate) mod flight;
 pub(crate) mod plan;

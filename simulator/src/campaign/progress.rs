@@ -35,13 +35,38 @@ impl ProgressBar {
     }
 }
 
+impl ProgressBar {
+    /// Shows that `done` of `total` parts are done, of something that is not counted in runs.
+    pub fn show(&self, label: &str, done: u64, total: u64) {
+        self.with(|current| {
+            let bar = current.get_or_insert_with(|| styled(total, "{msg:32} {wide_bar} {elapsed}"));
+            bar.set_message(label.to_owned());
+            bar.set_position(done);
+        });
+    }
+
+    /// Takes the bar away.
+    pub fn close(&self) {
+        self.with(|current| {
+            if let Some(bar) = current.take() {
+                bar.finish_and_clear();
+            }
+        });
+    }
+}
+
+fn styled(total: u64, style: &str) -> indicatif::ProgressBar {
+    let bar = indicatif::ProgressBar::new(total);
+    if let Ok(style) = indicatif::ProgressStyle::with_template(style) {
+        bar.set_style(style);
+    }
+    bar
+}
+
 impl Progress for ProgressBar {
     fn begin(&self, label: &str, total: u64) {
-        let bar = indicatif::ProgressBar::new(total).with_message(label.to_owned());
-        let style = "{msg:32} {wide_bar} {pos}/{len} {elapsed}";
-        if let Ok(style) = indicatif::ProgressStyle::with_template(style) {
-            bar.set_style(style);
-        }
+        let bar = styled(total, "{msg:32} {wide_bar} {pos}/{len} {elapsed}");
+        bar.set_message(label.to_owned());
         self.with(|current| *current = Some(bar));
     }
 
@@ -54,10 +79,6 @@ impl Progress for ProgressBar {
     }
 
     fn end(&self) {
-        self.with(|current| {
-            if let Some(bar) = current.take() {
-                bar.finish_and_clear();
-            }
-        });
+        self.close();
     }
 }

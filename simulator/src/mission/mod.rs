@@ -3,9 +3,12 @@
 //!
 //! Top level: `name`, `description` (where the numbers come from, and what the paper leaves open),
 //! `problem` (canonical JSON of `vbar.v1.Problem`), `simulation`, `published`. The last two mean
-//! what the problem's method needs: see [`Mission`], [`PlanMission`] and [`SamplingMission`]. Unknown fields are refused
+//! what the problem's method needs: see [`AbortMission`], [`Mission`], [`PlanMission`] and
+//! [`SamplingMission`]. Unknown fields are refused
 //! everywhere.
 
+pub(crate) mod abort;
+pub(crate) mod abort_model;
 pub(crate) mod law;
 pub(crate) mod model;
 pub(crate) mod plan;
@@ -24,6 +27,7 @@ use vbar_proto::{
     v1::{self, VariableHorizonScheme as Scheme},
 };
 
+pub use abort::{AbortCase, AbortMission, AbortSources};
 use law::{DisturbanceLaw, InitialLaw, Randomisation, TruthLaw};
 use model::Model;
 pub use plan::{PlanChanges, PlanMission, PublishedAxes, metric_name, metric_named};
@@ -38,6 +42,8 @@ pub const RUNS_MAX: u32 = 100_000;
 /// A mission of whichever method its problem names.
 #[derive(Debug, Clone)]
 pub enum MissionFile {
+    /// Closed loops that can be aborted at every step.
+    AbortSafe(Box<AbortMission>),
     /// Closed loops under variable-horizon control.
     VariableHorizon(Box<Mission>),
     /// Fixed-time plans with disturbance feedback.
@@ -68,6 +74,9 @@ impl MissionFile {
         }
         let head: Head = serde_json::from_str(text)?;
         let asks = |arms: [&str; 2]| arms.iter().any(|arm| head.problem.contains_key(*arm));
+        if asks(["abortSafe", "abort_safe"]) {
+            return AbortMission::parse(text).map(|mission| Self::AbortSafe(mission.into()));
+        }
         if asks(["disturbanceFeedback", "disturbance_feedback"]) {
             return PlanMission::parse(text)
                 .map(|mission| Self::DisturbanceFeedback(mission.into()));
@@ -83,6 +92,7 @@ impl MissionFile {
     #[must_use]
     pub fn name(&self) -> &str {
         match self {
+            Self::AbortSafe(mission) => &mission.name,
             Self::VariableHorizon(mission) => &mission.name,
             Self::DisturbanceFeedback(mission) => &mission.name,
             Self::OfflineSampling(mission) => &mission.name,
@@ -93,6 +103,7 @@ impl MissionFile {
     #[must_use]
     pub fn into_problem(self) -> v1::Problem {
         match self {
+            Self::AbortSafe(mission) => mission.problem,
             Self::VariableHorizon(mission) => mission.problem,
             Self::DisturbanceFeedback(mission) => mission.problem,
             Self::OfflineSampling(mission) => mission.problem,
@@ -409,15 +420,19 @@ mod tests {
         }
         names.sort();
         let expected = [
+            "active_abort",
             "double_integrator",
             "envisat",
             "gto",
             "hcw_docking",
+            "iss",
             "leo_tumbler",
+            "perturbed_55",
             "poseidyn",
             "prisma",
             "simbol_x",
             "tumbling_satellite",
+            "vbar_elliptic",
         ];
         assert_eq!(names, expected);
     }

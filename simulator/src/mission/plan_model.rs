@@ -43,7 +43,8 @@ impl PlanModel {
         let Some(inner) = disturbance_feedback(problem) else {
             return Err(vec![format!("{HERE}: required")]);
         };
-        let (elements, oriented) = orbit(inner.orbit.as_ref(), &mut faults);
+        let place = format!("{HERE}.orbit");
+        let (elements, oriented) = orbit(&place, inner.orbit.as_ref(), &mut faults);
         let initial = match inner.initial.as_ref().and_then(|initial| initial.form.as_ref()) {
             Some(initial_state::Form::Relative(state)) => {
                 relative(&format!("{HERE}.initial.relative"), Some(state), &mut faults)
@@ -71,13 +72,18 @@ impl PlanModel {
 
 const HERE: &str = "problem.disturbance_feedback";
 
-fn orbit(orbit: Option<&v1::TargetOrbit>, faults: &mut Vec<String>) -> (Elements, bool) {
+/// The orbit at `place`, and whether its orientation is given.
+pub(super) fn orbit(
+    place: &str,
+    orbit: Option<&v1::TargetOrbit>,
+    faults: &mut Vec<String>,
+) -> (Elements, bool) {
+    let place = format!("{place}.elements");
     let Some(target_orbit::Form::Elements(given)) = orbit.and_then(|orbit| orbit.form.as_ref())
     else {
-        faults.push(format!("{HERE}.orbit.elements: the simulator reads elements only"));
+        faults.push(format!("{place}: the simulator reads elements only"));
         return (reference_orbit(), false);
     };
-    let place = format!("{HERE}.orbit.elements");
     let semi_major_axis_m = given.semi_major_axis_m.unwrap_or(f64::NAN);
     let eccentricity = given.eccentricity.unwrap_or(f64::NAN);
     let true_anomaly_deg = given.true_anomaly_deg.unwrap_or(f64::NAN);

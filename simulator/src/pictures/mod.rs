@@ -3,6 +3,7 @@
 //! Which are drawn follows from what was flown: a spacecraft gets its trajectory, positions,
 //! snapshots of the cone; a plane plant gets its sets; several schemes get box plots.
 
+pub(crate) mod abort;
 mod chart;
 pub(crate) mod plan;
 mod plane;

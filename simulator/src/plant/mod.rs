@@ -4,11 +4,16 @@
 //! guidance that is being judged, so that one wrong sign cannot hide in both.
 
 pub(crate) mod cone;
+pub(crate) mod hermite;
 pub(crate) mod hill;
 pub(crate) mod linear;
 pub(crate) mod lvlh;
 pub(crate) mod planar;
+pub(crate) mod relative_truth;
 pub(crate) mod rotation;
+pub(crate) mod runge_kutta;
+pub(crate) mod sun_moon;
+pub(crate) mod target_track;
 pub(crate) mod thrusters;
 pub(crate) mod two_body;
 

@@ -1,5 +1,6 @@
 //! What a campaign showed: numbers for programs, a table for people, traces for other tools.
 
+pub(crate) mod abort;
 pub(crate) mod plan;
 pub(crate) mod sampling;
 mod statistics;

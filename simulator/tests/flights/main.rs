@@ -3,6 +3,7 @@
 //! Few runs each, so that the whole stays within seconds; the full campaigns are one command away
 //! (`vbar simulate`).
 
+mod aborts;
 mod closed_loops;
 mod plans;
 mod sampling;

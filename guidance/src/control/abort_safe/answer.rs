@@ -38,6 +38,9 @@ pub struct Step {
     pub trajectory: Option<Trajectory>,
     /// The proof; `None` without a regulator's command.
     pub certificate: Option<Certificate>,
+    /// The measured state is in a backward reachable set of its own time index: if thrusters
+    /// failed now, nothing would help.
+    pub unsafe_state: Option<UnsafeState>,
     /// What could be done if thrusters failed at the next sample; `None` in phases that avoid
     /// nothing, and without a command.
     pub safety: Option<StateVerdict>,
@@ -73,14 +76,18 @@ pub struct Command {
     pub softened: bool,
 }
 
-/// An abort.
+/// An abort. Once begun it goes on at every step, to drift when its sequence is over.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AbortCommand {
     /// Why.
     pub reason: AbortReason,
-    /// Thrusters that it uses.
+    /// Where the sequence is from.
+    pub origin: AbortOrigin,
+    /// Index of the step at which the abort began.
+    pub began: usize,
+    /// Thrusters that work.
     pub working: ThrustMode,
-    /// What to do.
+    /// What to do from this step on.
     pub abort: Abort,
 }
 
@@ -91,6 +98,21 @@ pub enum AbortReason {
     Failure,
     /// The regulator's problem has no answer. [AguilarMarsillach2022, remark 6]
     NoTrajectory,
+    /// An earlier step has begun it.
+    UnderWay,
+}
+
+/// Where an abort's sequence is from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AbortOrigin {
+    /// Searched at this step.
+    Searched,
+    /// What was left of the one under way, then drift: flown once more from the measured state,
+    /// it keeps out for a whole horizon from now.
+    Kept,
+    /// The same, but it keeps out only to the end of the horizon that it was found for, and no
+    /// better one exists or was found.
+    Tail,
 }
 
 /// The mission is complete.
@@ -113,17 +135,35 @@ pub struct Trajectory {
     pub forces_n: Vec<Vector3<f64>>,
 }
 
+/// A state that is unsafe already.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UnsafeState {
+    /// The failure whose set holds it deepest: thrusters that still work after it.
+    pub working: ThrustMode,
+    /// Seconds until the earliest instant whose set holds it.
+    pub doomed_after_s: f64,
+    /// The instant of the deepest set, in parts of a step after the state.
+    pub instant: usize,
+    /// Its gauge at the state, at most 1.
+    pub gauge: f64,
+    /// A state near it that no set of its time index holds, if one was found: nearest in metres
+    /// and in metres per second over the mean motion, among those that the search saw.
+    pub outside: Option<RelativeVector>,
+}
+
 /// What could be done from a state if thrusters failed there.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StateVerdict {
     /// Time index k of the state.
     pub index: usize,
+    /// The phase whose region is meant.
+    pub phase: usize,
     /// The state.
     pub state: RelativeVector,
-    /// One a mode of the phase.
+    /// One a mode that was asked for.
     pub modes: Vec<ModeVerdict>,
     /// What free drift does, for phases that avoid an ellipsoid passively; `None` else, and for a
-    /// chaser that is on no ellipse.
+    /// chaser whose own orbit is no ellipse.
     pub drift: Option<PassiveVerdict>,
 }
 
@@ -132,11 +172,20 @@ pub struct StateVerdict {
 pub struct ModeVerdict {
     /// Thrusters that still work.
     pub working: ThrustMode,
-    /// There is an instant at which the state is in the avoided set whatever is done.
-    pub inside_reachable_set: bool,
+    /// Seconds until the first instant at which the craft is in the avoided set whatever is done:
+    /// the earliest of the backward reachable sets that hold the state. `None` outside all.
+    pub doomed_after_s: Option<f64>,
     /// Whether an abort exists. Not the opposite of the above: outside every reachable set there
     /// can still be no abort.
     pub abort: AbortVerdict,
+}
+
+impl ModeVerdict {
+    /// Is the state in a backward reachable set of its own time index?
+    #[must_use]
+    pub fn inside_reachable_set(&self) -> bool {
+        self.doomed_after_s.is_some()
+    }
 }
 
 impl StateVerdict {
@@ -159,6 +208,8 @@ pub struct Diagnostics {
     pub least_clearance: f64,
     /// Largest violation of a half-space; 0 unless softened.
     pub violation: f64,
+    /// Why it was softened, and what would have made that needless.
+    pub infeasibility: Option<Infeasibility>,
     /// The closest moment of the predicted trajectory to the target, between samples too; `least`
     /// is in square metres. `None` without a prediction.
     pub closest: Option<Closest>,

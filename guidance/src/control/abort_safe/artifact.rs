@@ -2,39 +2,30 @@
 
 use std::ops::Range;
 
-use nalgebra::SMatrix;
-
-use super::{Phase, Problem, Safety, Watch};
+use super::{Phase, Problem, Safety, Watch, faults::faults};
 use crate::{
+    budget::Budget,
     bytes::{DecodeError, Reader, Writer},
-    control::{Failure, Fault, PrepareError},
+    control::{Failure, PrepareError},
     dynamics::PeriodicPlant,
-    mission::{AvoidanceSet, ThrustMode, dominating_modes},
+    mission::{ThrustMode, dominating_modes},
     reach::{EllipsoidUnion, PolytopeQuestion, PolytopeUnion},
-    sets::{CentredEllipsoid, Polytope},
-    units::Seconds,
+    sets::{CentredEllipsoid, Polytope, ZonotopeFacets},
 };
 
 /// Starts of one shard.
 const STARTS_A_SHARD: usize = 16;
-/// Most numbers that the sets of a phase may need: 512 MB.
-const NUMBERS_MAX: usize = 64_000_000;
-/// Longest prediction: the dense program's cost grows with its cube.
-const PREDICTION_MAX: usize = 120;
-/// Most steps of a period, of a safety horizon and parts of a step.
-const STEPS_MAX: usize = 10_000;
-const FRACTIONS_MAX: usize = 64;
-/// Most instants of a safety horizon: artifacts keep their indices in two bytes.
-const INSTANTS_MAX: usize = 60_000;
-const NEAREST_MAX: usize = 16;
-/// Coefficients of a general ellipsoid.
-const ELLIPSOID_TERMS: usize = 21;
+/// Sets of so many modes at most are counted, beside those that stand for all; every set of eight
+/// thrusters' failures is within it.
+const COUNTED_MODES_MAX: usize = 256;
 
 /// The prepared mission.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Artifact {
     problem: Problem,
-    phases: Vec<PreparedPhase>,
+    /// Forces of all thrusters.
+    nominal: ZonotopeFacets,
+    pub(super) phases: Vec<PreparedPhase>,
 }
 
 /// A phase with its plant and sets.
@@ -48,8 +39,19 @@ pub(super) struct PreparedPhase {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum PhaseSets {
     None,
-    Ellipsoids { avoid: CentredEllipsoid, union: EllipsoidUnion },
-    Polytopes { avoid: Polytope, modes: Vec<ThrustMode>, union: PolytopeUnion },
+    /// With the box around the ellipsoid, for aborts that thrust.
+    Ellipsoids {
+        avoid: CentredEllipsoid,
+        around: Polytope,
+        union: EllipsoidUnion,
+    },
+    /// With the modes that stand for all, and how many sets all of them have, if counted.
+    Polytopes {
+        avoid: Polytope,
+        modes: Vec<ThrustMode>,
+        union: PolytopeUnion,
+        sets_of_all_modes: Option<usize>,
+    },
 }
 
 /// Sets of some starts of one phase.
@@ -62,32 +64,8 @@ pub struct Shard {
 enum ShardPart {
     Nothing,
     Ellipsoids(usize, EllipsoidUnion),
-    Polytopes(usize, PolytopeUnion),
-}
-
-/// What an artifact holds, to be shown.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Summary {
-    /// kp steps minus one revolution.
-    pub fold_error: Seconds,
-    /// One a phase.
-    pub phases: Vec<PhaseSummary>,
-}
-
-/// One phase of a [`Summary`].
-#[derive(Debug, Clone, PartialEq)]
-pub struct PhaseSummary {
-    /// Backward reachable sets that are not empty, over all starts.
-    pub sets: usize,
-    /// Bytes of their numbers.
-    pub size_bytes: usize,
-    /// Modes whose sets hold those of all modes that were asked for.
-    pub dominating_modes: Vec<ThrustMode>,
-    /// The bound on speeds, m/s, if a plausible approach is faster: such an approach would pass
-    /// through the region unseen.
-    pub hides_approaches_above_m_s: Option<f64>,
-    /// The region is an ellipsoid, but active modes need a polytope: the box around it is used.
-    pub outer_box: bool,
+    /// With the number of sets of all modes that were asked for, if counted.
+    Polytopes(usize, PolytopeUnion, Option<usize>),
 }
 
 impl Artifact {
@@ -96,7 +74,7 @@ impl Artifact {
     /// # Errors
     /// [`PrepareError::Faults`] with every fault of the problem.
     pub fn prepare(problem: &Problem) -> Result<Self, PrepareError> {
-        let shards = (0..shard_count(problem)).map(|i| run_shard(problem, i));
+        let shards = (0..shard_count(problem)).map(|i| run_shard(problem, i, Budget::UNLIMITED));
         let shards = shards.collect::<Result<Vec<_>, _>>()?;
         merge(problem, shards)
     }
@@ -107,36 +85,8 @@ impl Artifact {
         &self.problem
     }
 
-    /// What it holds.
-    #[must_use]
-    pub fn summary(&self) -> Summary {
-        let phases = self.problem.phases.iter().zip(&self.phases);
-        Summary {
-            fold_error: self
-                .phases
-                .first()
-                .map_or(Seconds::from_seconds(0.0), |phase| phase.plant.fold_error()),
-            phases: phases.map(|(asked, prepared)| self.phase_summary(asked, prepared)).collect(),
-        }
-    }
-
-    fn phase_summary(&self, asked: &Phase, prepared: &PreparedPhase) -> PhaseSummary {
-        let (sets, size_bytes) = match &prepared.sets {
-            PhaseSets::None => (0, 0),
-            PhaseSets::Ellipsoids { union, .. } => (union.len(), union.size_bytes()),
-            PhaseSets::Polytopes { union, .. } => (union.len(), union.size_bytes()),
-        };
-        let fastest = self.problem.fastest_approach_m_s;
-        let watch = asked.safety.watch();
-        PhaseSummary {
-            sets,
-            size_bytes,
-            dominating_modes: dominating_modes(asked.safety.modes()),
-            hides_approaches_above_m_s: watch
-                .and_then(|watch| watch.avoid.hides_approaches_above(fastest)),
-            outer_box: matches!(&asked.safety, Safety::Active { watch, .. }
-                if !watch.avoid.is_polytope()),
-        }
+    pub(super) fn nominal_forces(&self) -> &ZonotopeFacets {
+        &self.nominal
     }
 
     pub(super) fn phase(&self, index: usize) -> (&Phase, &PreparedPhase) {
@@ -153,7 +103,10 @@ impl Artifact {
             match &phase.sets {
                 PhaseSets::None => {}
                 PhaseSets::Ellipsoids { union, .. } => union.write(&mut writer),
-                PhaseSets::Polytopes { union, .. } => union.write(&mut writer),
+                PhaseSets::Polytopes { union, sets_of_all_modes, .. } => {
+                    union.write(&mut writer);
+                    writer.option(*sets_of_all_modes, Writer::count);
+                }
             }
         }
         writer.finish()
@@ -175,28 +128,33 @@ impl Artifact {
             let plant = plant(&problem, phase);
             let instants = |watch: &Watch| watch.horizon * watch.fractions + 1;
             let sets = match (phase.safety.watch(), form(phase)) {
-                (Some(watch), Form::Ellipsoid(avoid)) => {
+                (Some(watch), Form::Ellipsoid(avoid, around)) => {
                     let union = EllipsoidUnion::read(&mut reader, starts, instants(watch))?;
-                    PhaseSets::Ellipsoids { avoid, union }
+                    PhaseSets::Ellipsoids { avoid, around, union }
                 }
                 (Some(watch), Form::Polytope(avoid, modes)) => {
                     let count = instants(watch);
                     let union = PolytopeUnion::read(&mut reader, starts, modes.len(), count)?;
-                    PhaseSets::Polytopes { avoid, modes, union }
+                    let sets_of_all_modes = reader.option(Reader::count)?;
+                    PhaseSets::Polytopes { avoid, modes, union, sets_of_all_modes }
                 }
                 _ => PhaseSets::None,
             };
             phases.push(PreparedPhase { plant, sets });
         }
         reader.end()?;
-        Ok(Self { problem, phases })
+        Ok(Self { nominal: nominal(&problem), problem, phases })
     }
+}
+
+fn nominal(problem: &Problem) -> ZonotopeFacets {
+    problem.thrusters.admissible(problem.thrusters.nominal()).facets()
 }
 
 /// How the set of a phase is represented.
 enum Form {
     None,
-    Ellipsoid(CentredEllipsoid),
+    Ellipsoid(CentredEllipsoid, Polytope),
     Polytope(Polytope, Vec<ThrustMode>),
 }
 
@@ -206,7 +164,7 @@ fn form(phase: &Phase) -> Form {
     let Some(set) = watch.avoid.inflated(watch.inflation) else { return Form::None };
     let passive = matches!(phase.safety, Safety::Passive(_));
     match set.ellipsoid().filter(|_| passive) {
-        Some(ellipsoid) => Form::Ellipsoid(ellipsoid),
+        Some(ellipsoid) => Form::Ellipsoid(ellipsoid, set.outer_polytope()),
         None => Form::Polytope(set.outer_polytope(), dominating_modes(phase.safety.modes())),
     }
 }
@@ -235,7 +193,12 @@ pub(super) fn shard_count(problem: &Problem) -> usize {
     (watched * problem.steps_per_period.div_ceil(STARTS_A_SHARD)).max(1)
 }
 
-pub(super) fn run_shard(problem: &Problem, shard: usize) -> Result<Shard, PrepareError> {
+pub(super) fn run_shard(
+    problem: &Problem,
+    shard: usize,
+    budget: Budget<'_>,
+) -> Result<Shard, PrepareError> {
+    budget.check()?;
     let found = faults(problem);
     if !found.is_empty() {
         return Err(PrepareError::Faults(found));
@@ -248,20 +211,31 @@ pub(super) fn run_shard(problem: &Problem, shard: usize) -> Result<Shard, Prepar
     let horizon = phase.safety.watch().map_or(0, |watch| watch.horizon);
     let part = match form(phase) {
         Form::None => ShardPart::Nothing,
-        Form::Ellipsoid(avoid) => {
-            ShardPart::Ellipsoids(index, EllipsoidUnion::new(&plant, &avoid, horizon, starts))
+        Form::Ellipsoid(avoid, _) => {
+            let union = EllipsoidUnion::new(&plant, &avoid, horizon, starts, budget)?;
+            ShardPart::Ellipsoids(index, union)
         }
         Form::Polytope(avoid, modes) => {
             let forces = problem.thrusters.full_forces_n();
-            let bits: Vec<u32> = modes.iter().map(|mode| mode.bits()).collect();
+            let bits = |modes: &[ThrustMode]| modes.iter().map(|mode| mode.bits()).collect();
+            let (needed, all): (Vec<u32>, Vec<u32>) = (bits(&modes), bits(phase.safety.modes()));
             let question = PolytopeQuestion {
                 plant: &plant,
                 avoid: &avoid,
                 full_forces_n: &forces,
-                modes: &bits,
+                modes: &needed,
                 horizon,
             };
-            ShardPart::Polytopes(index, PolytopeUnion::new(&question, starts))
+            let union = PolytopeUnion::new(&question, starts.clone(), budget)?;
+            let count = match all.len() {
+                few if few == needed.len() => Some(union.len()),
+                0..=COUNTED_MODES_MAX => {
+                    let question = PolytopeQuestion { modes: &all, ..question };
+                    Some(PolytopeUnion::count(&question, starts, budget)?)
+                }
+                _ => None,
+            };
+            ShardPart::Polytopes(index, union, count)
         }
     };
     Ok(Shard { part })
@@ -276,151 +250,41 @@ pub(super) fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, P
     let missing = || PrepareError::Failure(Failure::Numerical("shards are missing".into()));
     let mut ellipsoids: Vec<Vec<EllipsoidUnion>> = vec![Vec::new(); count];
     let mut polytopes: Vec<Vec<PolytopeUnion>> = vec![Vec::new(); count];
+    let mut counts: Vec<Option<usize>> = vec![Some(0); count];
     for shard in shards {
         match shard.part {
             ShardPart::Nothing => {}
             ShardPart::Ellipsoids(phase, union) => {
                 ellipsoids.get_mut(phase).ok_or_else(missing)?.push(union);
             }
-            ShardPart::Polytopes(phase, union) => {
+            ShardPart::Polytopes(phase, union, sets) => {
                 polytopes.get_mut(phase).ok_or_else(missing)?.push(union);
+                counts[phase] = counts[phase].zip(sets).map(|(sum, sets)| sum + sets);
             }
         }
     }
     let starts = problem.steps_per_period;
-    let parts = problem.phases.iter().zip(ellipsoids.into_iter().zip(polytopes));
-    let phases = parts
-        .map(|(phase, (ellipsoids, polytopes))| {
+    let parts = ellipsoids.into_iter().zip(polytopes).zip(counts);
+    let phases = problem.phases.iter().zip(parts);
+    let phases = phases
+        .map(|(phase, ((ellipsoids, polytopes), sets_of_all_modes))| {
             let sets = match form(phase) {
                 Form::None => PhaseSets::None,
-                Form::Ellipsoid(avoid) => {
+                Form::Ellipsoid(avoid, around) => {
                     let union = EllipsoidUnion::joined(ellipsoids)
                         .filter(|union| union.starts() == starts)
                         .ok_or_else(missing)?;
-                    PhaseSets::Ellipsoids { avoid, union }
+                    PhaseSets::Ellipsoids { avoid, around, union }
                 }
                 Form::Polytope(avoid, modes) => {
                     let union = PolytopeUnion::joined(polytopes)
                         .filter(|union| union.starts() == starts)
                         .ok_or_else(missing)?;
-                    PhaseSets::Polytopes { avoid, modes, union }
+                    PhaseSets::Polytopes { avoid, modes, union, sets_of_all_modes }
                 }
             };
             Ok(PreparedPhase { plant: plant(problem, phase), sets })
         })
         .collect::<Result<_, PrepareError>>()?;
-    Ok(Artifact { problem: problem.clone(), phases })
-}
-
-/// Everything that is wrong with a problem.
-fn faults(problem: &Problem) -> Vec<Fault> {
-    let mut faults = Vec::new();
-    let mut require = |right: bool, field: String, expected: &str, got: String| {
-        if !right {
-            faults.push(Fault::new(field, expected, got));
-        }
-    };
-    let between = |x: usize, most: usize| (1..=most).contains(&x);
-    let positive = |x: f64| x > 0.0 && x.is_finite();
-    let text = |field: &str| field.to_owned();
-    let mass = problem.mass.kilograms();
-    require(positive(mass), text("mass"), "a positive mass", mass.to_string());
-    let step = problem.sample_time.seconds();
-    require(positive(step), text("sample_time"), "a positive time", step.to_string());
-    let kp = problem.steps_per_period;
-    let count = "between 1 and 10000";
-    require(between(kp, STEPS_MAX), text("steps_per_period"), count, kp.to_string());
-    let invariant = kp == 1 && problem.orbit.eccentricity() == 0.0;
-    let miss = kp as f64 * step - problem.orbit.period().seconds();
-    let folds = invariant || miss.abs() <= 0.5 * step;
-    let whole = "a revolution within half a step";
-    require(folds, text("steps_per_period"), whole, format!("{miss} s off"));
-    let n = problem.prediction_horizon;
-    require(between(n, PREDICTION_MAX), text("prediction_horizon"), "1 to 120", n.to_string());
-    let limits = [
-        ("clearance", problem.clearance),
-        ("arrival", problem.arrival.metres()),
-        ("fastest_approach_m_s", problem.fastest_approach_m_s),
-        ("abort_clearance", problem.abort_clearance),
-    ];
-    for (field, value) in limits {
-        require(positive(value), text(field), "a positive number", value.to_string());
-    }
-    require(!problem.phases.is_empty(), text("phases"), "at least one phase", text("none"));
-    for (i, phase) in problem.phases.iter().enumerate() {
-        phase_faults(problem, i, phase, &mut require);
-    }
-    faults
-}
-
-fn phase_faults(
-    problem: &Problem,
-    index: usize,
-    phase: &Phase,
-    require: &mut impl FnMut(bool, String, &str, String),
-) {
-    let field = |name: &str| format!("phases[{index}].{name}");
-    let sound = |matrix: &SMatrix<f64, 6, 6>| {
-        (matrix - matrix.transpose()).amax() <= 1e-9 * matrix.amax()
-            && matrix.iter().all(|x| x.is_finite())
-            && matrix.symmetric_eigenvalues().iter().all(|&x| x >= -1e-9 * matrix.amax())
-    };
-    let semidefinite = "a symmetric positive semidefinite matrix";
-    let weights = &phase.weights;
-    require(sound(&weights.stage), field("weights.stage"), semidefinite, "not so".into());
-    require(sound(&weights.terminal), field("weights.terminal"), semidefinite, "not so".into());
-    let definite = (weights.input - weights.input.transpose()).amax()
-        <= 1e-9 * weights.input.amax()
-        && weights.input.cholesky().is_some();
-    let expected = "a symmetric positive definite matrix";
-    require(definite, field("weights.input"), expected, "not so".into());
-    let within = phase.advance_within.metres();
-    require(
-        within >= 0.0 && within.is_finite(),
-        field("advance_within"),
-        "at least 0 m",
-        within.to_string(),
-    );
-    if let Safety::Active { modes, .. } = &phase.safety {
-        require(!modes.is_empty(), field("modes"), "at least one mode", "none".into());
-        let known = modes.iter().all(|mode| mode.is_within(problem.thrusters.nominal()));
-        require(known, field("modes"), "thrusters of the chaser", "another one".into());
-    }
-    let Some(watch) = phase.safety.watch() else { return };
-    let between = |x: usize, most: usize| (1..=most).contains(&x);
-    let gamma = watch.inflation;
-    let grows = gamma >= 1.0 && gamma.is_finite();
-    require(grows, field("inflation"), "at least 1", gamma.to_string());
-    let (horizon, parts, nearest) = (watch.horizon, watch.fractions, watch.nearest);
-    require(between(horizon, STEPS_MAX), field("horizon"), "1 to 10000", horizon.to_string());
-    require(between(parts, FRACTIONS_MAX), field("fractions"), "1 to 64", parts.to_string());
-    require(between(nearest, NEAREST_MAX), field("nearest"), "1 to 16", nearest.to_string());
-    let instants = horizon.saturating_mul(parts);
-    let few = instants <= INSTANTS_MAX;
-    require(few, field("fractions"), "60000 instants at most", instants.to_string());
-    let numbers = [problem.steps_per_period, horizon, parts, ELLIPSOID_TERMS]
-        .iter()
-        .try_fold(1usize, |product, &x| product.checked_mul(x))
-        .unwrap_or(usize::MAX);
-    let fits = numbers <= NUMBERS_MAX;
-    require(fits, field("horizon"), "sets of at most 512 MB", format!("{numbers} numbers"));
-}
-
-/// Distance from a position to the region of a set, metres; 0 inside.
-pub(super) fn distance_to_region(avoid: &AvoidanceSet, position: &nalgebra::Vector3<f64>) -> f64 {
-    let point = nalgebra::DVector::from_column_slice(position.as_slice());
-    if let Some(precision) = avoid.position_precision() {
-        let precision = nalgebra::DMatrix::from_fn(3, 3, |i, j| precision[(i, j)]);
-        return CentredEllipsoid::from_precision(precision)
-            .map_or(f64::INFINITY, |region| (region.nearest_point(&point) - point).norm());
-    }
-    let lifted = avoid.outer_polytope();
-    let rows: Vec<usize> = (0..lifted.offsets().len())
-        .filter(|&r| (0..3).any(|c| lifted.normals()[(r, c)] != 0.0))
-        .collect();
-    let normals = lifted.normals().select_rows(&rows).columns(0, 3).into_owned();
-    let offsets = lifted.offsets().select_rows(&rows);
-    let sides = crate::program::HalfSpaces { normals: &normals, offsets: &offsets };
-    crate::program::nearest_point_of_polytope(sides, &point)
-        .map_or(f64::INFINITY, |nearest| (nearest - point).norm())
+    Ok(Artifact { nominal: nominal(problem), problem: problem.clone(), phases })
 }

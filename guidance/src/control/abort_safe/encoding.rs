@@ -2,9 +2,10 @@
 
 use nalgebra::SMatrix;
 
-use super::{Fallback, Phase, Problem, Safety, SetTiming, Watch, Weights};
+use super::{Fallback, Phase, Problem, Safety, Separation, SetTiming, Watch, Weights};
 use crate::{
     bytes::{DecodeError, Reader, Writer},
+    control::canonical::{read_epoch, write_epoch},
     mission::{AvoidanceRegion, AvoidanceSet, ThrustMode, Thruster, Thrusters},
     orbit::KeplerOrbit,
     units::{Distance, Force, Mass, Seconds},
@@ -21,6 +22,7 @@ impl Problem {
 }
 
 pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
+    writer.option(problem.epoch, write_epoch);
     problem.orbit.write(writer);
     writer.number(problem.mass.kilograms());
     writer.number(problem.sample_time.seconds());
@@ -38,6 +40,11 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
         SetTiming::Timed => 1,
         SetTiming::Untimed => 2,
     });
+    writer.tag(match problem.separation {
+        Separation::Tangent => 1,
+        Separation::LinearProgram => 2,
+        Separation::SecondOrderCone => 3,
+    });
     writer.tag(match problem.fallback {
         Fallback::Soften => 1,
         Fallback::Abort => 2,
@@ -50,6 +57,7 @@ pub(super) fn write_problem(writer: &mut Writer, problem: &Problem) {
 }
 
 pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeError> {
+    let epoch = reader.option(read_epoch)?;
     let orbit = KeplerOrbit::read(reader)?;
     let mass = Mass::from_kilograms(reader.number()?);
     let sample_time = Seconds::from_seconds(reader.number()?);
@@ -68,14 +76,21 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
     let timing = match reader.tag()? {
         1 => SetTiming::Timed,
         2 => SetTiming::Untimed,
-        other => return Err(unknown(reader, "timing", other)),
+        other => return Err(reader.unknown("timing", other)),
+    };
+    let separation = match reader.tag()? {
+        1 => Separation::Tangent,
+        2 => Separation::LinearProgram,
+        3 => Separation::SecondOrderCone,
+        other => return Err(reader.unknown("separation", other)),
     };
     let fallback = match reader.tag()? {
         1 => Fallback::Soften,
         2 => Fallback::Abort,
-        other => return Err(unknown(reader, "fallback", other)),
+        other => return Err(reader.unknown("fallback", other)),
     };
     Ok(Problem {
+        epoch,
         orbit,
         mass,
         sample_time,
@@ -85,6 +100,7 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         prediction_horizon,
         clearance,
         timing,
+        separation,
         fallback,
         arrival: Distance::from_metres(reader.number()?),
         fastest_approach_m_s: reader.number()?,
@@ -92,10 +108,6 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         abort_clearance: reader.number()?,
         steps_max: reader.count()?,
     })
-}
-
-fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
-    reader.fault(format!("{what} {tag} is not known"))
 }
 
 fn write_phase(writer: &mut Writer, phase: &Phase) {
@@ -132,7 +144,7 @@ fn read_phase(reader: &mut Reader<'_>) -> Result<Phase, DecodeError> {
             Safety::Active { watch, modes }
         }
         3 => Safety::None,
-        other => return Err(unknown(reader, "safety", other)),
+        other => return Err(reader.unknown("safety", other)),
     };
     let weights = Weights {
         stage: read_fixed(reader)?,
@@ -190,7 +202,7 @@ fn read_watch(reader: &mut Reader<'_>) -> Result<Watch, DecodeError> {
         3 => AvoidanceRegion::ShapeMatrix(read_fixed::<3, 3>(reader)?),
         4 => AvoidanceRegion::HalfWidths(reader.vector3()?),
         5 => AvoidanceRegion::Faces { normals: reader.matrix()?, offsets: reader.vector()? },
-        other => return Err(unknown(reader, "region", other)),
+        other => return Err(reader.unknown("region", other)),
     };
     let avoid = AvoidanceSet::new(region, reader.number()?)
         .ok_or_else(|| reader.fault("a region that is not one"))?;

@@ -18,14 +18,18 @@
 //! # Online
 //! [`AbortSafe::step`](Controller::step): for each predicted state of the last step the l nearest
 //! sets of its own time index, one half-space off each, and a quadratic program (23). The answer
-//! says of the next state, for every failure, whether an abort exists, and gives one.
+//! says of the next state, for every failure, whether an abort exists, and gives one. An abort
+//! that has begun goes on: what is left of its sequence is flown once more from each measured
+//! state, and replaced when it no longer keeps out.
 //!
 //! # Guarantee and its assumptions
 //! A state outside the passive sets of its time index drifts clear of S at the instants of the
 //! safety horizon, as the linear plant has it; what happens between instants and without
 //! linearisation is reported beside it. For failures of some thrusters nothing follows from being
-//! outside the sets: there the verdict on each mode is what counts, found by exact search. Only
-//! the l nearest sets are cut off, so the next state is judged against all of them.
+//! outside the sets: there the verdict on each mode is what counts, found by exact search, and an
+//! abort is found only if it keeps out between instants too. Only the l nearest sets are cut off,
+//! so the next state is judged against all of them. A mission that starts inside a set of its own
+//! time index is refused.
 //!
 //! # Where we differ from the paper
 //! - Proposition III.1 fails for active modes: a set is "there is an instant such that for all
@@ -34,8 +38,9 @@
 //!   (12) makes the paper's own start infeasible; it is an option.
 //! - (5) has lost the dots on two velocities; (31) and (32d) need Q^(1/2) a; (33) needs v_m^2;
 //!   the tangent of remark 5 has no factor 2.
-//! - One half-space for each set: a common one (28), (32) rarely exists for several sets. Where
-//!   (28) has no bound, because the origin is outside the set, the Euclidean projection is used.
+//! - One half-space for each set, unless the programs (28) and (32) are asked for: a common one
+//!   rarely exists for several sets, and where it does not, each gets its own again. Where (28)
+//!   has no bound, because the origin is outside the set, the Euclidean projection is used.
 //! - Sets are ranked by gauge, not by a distance that adds metres to metres per second.
 //! - gamma inflates S before it is propagated, not the propagated offsets.
 //! - Phases advance by the distance of the position to the region, and never go back.
@@ -45,20 +50,30 @@
 
 mod answer;
 mod artifact;
+mod cuts;
 mod encoding;
+mod faults;
+mod leave;
 mod problem;
+mod regulator;
 mod safety;
 mod state;
 mod step;
+mod summary;
+mod unsafe_state;
 
 pub use answer::{
-    AbortCommand, AbortReason, Arrival, Command, Diagnostics, Measurement, ModeVerdict,
-    StateVerdict, Step, Trajectory, Verdict,
+    AbortCommand, AbortOrigin, AbortReason, Arrival, Command, Diagnostics, Measurement,
+    ModeVerdict, StateVerdict, Step, Trajectory, UnsafeState, Verdict,
 };
-pub use artifact::{Artifact, PhaseSummary, Shard, Summary};
-pub use problem::{Fallback, Phase, Problem, Safety, SetTiming, Watch, Weights};
-pub use safety::safety_report;
+pub use artifact::{Artifact, Shard};
+pub use faults::{
+    FRACTIONS_MAX, INSTANTS_MAX, NEAREST_MAX, NUMBERS_MAX, PREDICTION_MAX, STEPS_MAX,
+};
+pub use problem::{Fallback, Phase, Problem, Safety, Separation, SetTiming, Watch, Weights};
+pub use safety::{SafetyQuestion, safety_report};
 pub use state::State;
+pub use summary::{PhaseSummary, Summary};
 
 use super::{Controller, PrepareError, StepError};
 use crate::budget::Budget;
@@ -87,8 +102,7 @@ impl Controller for AbortSafe {
         shard: usize,
         budget: Budget<'_>,
     ) -> Result<Shard, PrepareError> {
-        budget.check()?;
-        artifact::run_shard(problem, shard)
+        artifact::run_shard(problem, shard, budget)
     }
 
     fn merge(

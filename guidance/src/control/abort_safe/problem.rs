@@ -3,6 +3,7 @@
 use nalgebra::{Matrix3, SMatrix};
 
 use crate::{
+    epoch::Epoch,
     mission::{AvoidanceSet, ThrustMode, Thrusters},
     orbit::KeplerOrbit,
     units::{Distance, Mass, Seconds},
@@ -11,6 +12,8 @@ use crate::{
 /// A rendezvous that can be aborted at every step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
+    /// The moment of step 0, for documents; the mathematics counts from it.
+    pub epoch: Option<Epoch>,
     /// The target's orbit; its true anomaly is that of step 0.
     pub orbit: KeplerOrbit,
     /// Of the chaser.
@@ -30,6 +33,8 @@ pub struct Problem {
     pub clearance: f64,
     /// Which sets threaten a predicted state.
     pub timing: SetTiming,
+    /// How half-spaces that leave them out are found.
+    pub separation: Separation,
     /// What to do when no trajectory clears every half-space.
     pub fallback: Fallback,
     /// Largest distance from the target at which the last phase counts as arrived.
@@ -106,6 +111,23 @@ pub enum SetTiming {
     /// Those of every start along the orbit: (12) taken literally. Makes the paper's own start
     /// infeasible.
     Untimed,
+}
+
+/// How half-spaces that leave sets out are found.
+///
+/// A common half-space need not exist, and one that leaves the predicted state out rarely does for
+/// sets on different sides of it. Then, and in phases whose sets are of the other kind, each set
+/// gets its own tangent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Separation {
+    /// One a set: the tangent where the ray to the predicted state leaves it, which is the optimum
+    /// of the other two for a single set. [AguilarMarsillach2022, remark 5]
+    Tangent,
+    /// One for all the nearest polytopes by a linear program. [AguilarMarsillach2022, eq. 28]
+    LinearProgram,
+    /// One for all the nearest ellipsoids by a second-order cone program.
+    /// [AguilarMarsillach2022, eq. 32]
+    SecondOrderCone,
 }
 
 /// What to do when no trajectory clears every half-space.

@@ -3,7 +3,7 @@
 use super::{ArrivalMetric, Instants, Problem};
 use crate::{
     bytes::{DecodeError, Reader, Writer},
-    epoch::{Epoch, TimeSystem},
+    control::canonical::{read_epoch, write_epoch},
     frames::{InFrame, LvlhCcsds, RelativeState},
     orbit::KeplerOrbit,
     sets::{Ellipsoid, OuterSum},
@@ -71,19 +71,19 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
     let outer_sum = match reader.tag()? {
         1 => OuterSum::MinVolume,
         2 => OuterSum::MinTrace,
-        other => return Err(unknown(reader, "outer sum", other)),
+        other => return Err(reader.unknown("outer sum", other)),
     };
     let metric = match reader.tag()? {
         1 => ArrivalMetric::Position,
         2 => ArrivalMetric::Scaled6,
         3 => ArrivalMetric::Physical6,
-        other => return Err(unknown(reader, "metric", other)),
+        other => return Err(reader.unknown("metric", other)),
     };
     let (fuel_weight, effort_weight) = (reader.number()?, reader.number()?);
     let compare_open_loop = match reader.tag()? {
         0 => false,
         1 => true,
-        other => return Err(unknown(reader, "comparison", other)),
+        other => return Err(reader.unknown("comparison", other)),
     };
     let problem = Problem {
         orbit,
@@ -103,34 +103,6 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         None => Ok(problem),
         Some(fault) => Err(reader.fault(format!("{}: {}", fault.field, fault.got))),
     }
-}
-
-fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
-    reader.fault(format!("{what} {tag} is not known"))
-}
-
-fn write_epoch(writer: &mut Writer, epoch: Epoch) {
-    writer.integer(epoch.nanoseconds_since_j2000_tai);
-    writer.tag(match epoch.time_system {
-        TimeSystem::Utc => 1,
-        TimeSystem::Tai => 2,
-        TimeSystem::Tt => 3,
-        TimeSystem::Gps => 4,
-        TimeSystem::Tdb => 5,
-    });
-}
-
-fn read_epoch(reader: &mut Reader<'_>) -> Result<Epoch, DecodeError> {
-    let nanoseconds_since_j2000_tai = reader.integer()?;
-    let time_system = match reader.tag()? {
-        1 => TimeSystem::Utc,
-        2 => TimeSystem::Tai,
-        3 => TimeSystem::Tt,
-        4 => TimeSystem::Gps,
-        5 => TimeSystem::Tdb,
-        other => return Err(unknown(reader, "time system", other)),
-    };
-    Ok(Epoch { nanoseconds_since_j2000_tai, time_system })
 }
 
 fn write_state(writer: &mut Writer, state: &RelativeState<LvlhCcsds>) {
@@ -175,6 +147,6 @@ fn read_instants(reader: &mut Reader<'_>) -> Result<Instants, DecodeError> {
             let times = reader.numbers()?;
             Ok(Instants::Given(times.into_iter().map(Seconds::from_seconds).collect()))
         }
-        other => Err(unknown(reader, "instants", other)),
+        other => Err(reader.unknown("instants", other)),
     }
 }

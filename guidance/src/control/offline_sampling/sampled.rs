@@ -76,6 +76,8 @@ impl<'a> Sampling<'a> {
     }
 }
 
+/// Share of epsilon that is spent where rows are sampled, and are most.
+const PART_SHARE: f64 = 0.8;
 /// What rounding may add to a removed row at an extreme point, relative.
 const CHECK_TOLERANCE: f64 = 1e-7;
 
@@ -98,7 +100,7 @@ fn tolerances(redundancy: Redundancy) -> (f64, f64) {
     match redundancy {
         Redundancy::Exact => (EXACT, EXACT),
         Redundancy::InnerScaled { epsilon } => {
-            let part = 0.5 * epsilon;
+            let part = PART_SHARE * epsilon;
             (part, (1.0 + epsilon) / (1.0 + part) - 1.0)
         }
     }

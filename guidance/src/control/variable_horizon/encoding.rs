@@ -82,38 +82,38 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
     let plant = match reader.tag()? {
         1 => Plant::Hill(read_hill(reader)?),
         2 => Plant::Linear(read_linear(reader)?),
-        other => return Err(unknown(reader, "plant", other)),
+        other => return Err(reader.unknown("plant", other)),
     };
     let scheme = match reader.tag()? {
         1 => Scheme::AdaptiveTerminal,
         2 => Scheme::FixedTerminal,
         3 => Scheme::TubeOptimalControl,
         4 => Scheme::Nominal,
-        other => return Err(unknown(reader, "scheme", other)),
+        other => return Err(reader.unknown("scheme", other)),
     };
     let gain = match reader.tag()? {
         1 => GainChoice::Explicit(reader.matrix()?),
         2 => GainChoice::Poles(reader.numbers()?),
         3 => GainChoice::Lqr { state: reader.matrix()?, input: reader.matrix()? },
-        other => return Err(unknown(reader, "gain", other)),
+        other => return Err(reader.unknown("gain", other)),
     };
     let weights = Weights { fuel: reader.number()?, tracking: reader.number()? };
     let search = match reader.tag()? {
         1 => HorizonSearch::Local,
         2 => HorizonSearch::Enumeration,
-        other => return Err(unknown(reader, "search", other)),
+        other => return Err(reader.unknown("search", other)),
     };
     let horizon_max = reader.count()?;
     let horizon_guess = reader.option(Reader::count)?;
     let terminal_point = match reader.tag()? {
         1 => TerminalPoint::Projection,
         2 => TerminalPoint::Reference,
-        other => return Err(unknown(reader, "terminal point", other)),
+        other => return Err(reader.unknown("terminal point", other)),
     };
     let fallback = match reader.tag()? {
         1 => TerminalFallback::PreviousHorizon,
         2 => TerminalFallback::FreeHorizon,
-        other => return Err(unknown(reader, "fallback", other)),
+        other => return Err(reader.unknown("fallback", other)),
     };
     Ok(Problem {
         plant,
@@ -128,10 +128,6 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
         steps_max: reader.count()?,
         fixed_terminal_terms: reader.option(Reader::count)?,
     })
-}
-
-fn unknown(reader: &Reader<'_>, what: &str, tag: u8) -> DecodeError {
-    reader.fault(format!("{what} {tag} is not known"))
 }
 
 fn write_hill(writer: &mut Writer, plant: &HillPlant) {
@@ -219,7 +215,7 @@ fn read_hill(reader: &mut Reader<'_>) -> Result<HillPlant, DecodeError> {
             };
             TargetMotion::Sampled((0..count).map(|_| sample(reader)).collect::<Result<_, _>>()?)
         }
-        other => return Err(unknown(reader, "target motion", other)),
+        other => return Err(reader.unknown("target motion", other)),
     };
     let disturbance = match reader.tag()? {
         1 => DisturbanceSet::None,
@@ -234,7 +230,7 @@ fn read_hill(reader: &mut Reader<'_>) -> Result<HillPlant, DecodeError> {
             thrust_magnitude_error: reader.number()?,
             pointing_error_max: Angle::from_radians(reader.number()?),
         }),
-        other => return Err(unknown(reader, "disturbance set", other)),
+        other => return Err(reader.unknown("disturbance set", other)),
     };
     Ok(HillPlant {
         mean_motion_rad_s,
@@ -295,10 +291,10 @@ fn read_body(reader: &mut Reader<'_>) -> Result<BodyMotion, DecodeError> {
             relative_to: match reader.tag()? {
                 1 => RateReference::Inertial,
                 2 => RateReference::Rtn,
-                other => return Err(unknown(reader, "rate reference", other)),
+                other => return Err(reader.unknown("rate reference", other)),
             },
         },
-        other => return Err(unknown(reader, "body motion", other)),
+        other => return Err(reader.unknown("body motion", other)),
     })
 }
 

@@ -24,6 +24,9 @@ use super::Status;
 /// Rows are padded to a multiple of this, so that sums run in four lanes without a remainder.
 const LANES: usize = 4;
 
+/// In rows up to this length, looking for zeros costs more than multiplying them.
+const SHORT: usize = 32;
+
 /// Rows a_i of a program, flat and row by row.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DenseRows {
@@ -32,6 +35,9 @@ pub struct DenseRows {
     normals: Vec<f64>,
     /// 1 / |a_i|, or 1 for a row of zeros.
     scales: Vec<f64>,
+    /// Where the entries other than 0 begin and end, in whole lanes: rows over many stages are
+    /// mostly zeros.
+    supports: Vec<(u32, u32)>,
 }
 
 /// H (n x n) with its factor.
@@ -100,7 +106,7 @@ impl DenseRows {
     #[must_use]
     pub fn new(columns: usize) -> Self {
         let stride = columns.div_ceil(LANES) * LANES;
-        Self { columns, stride, normals: Vec::new(), scales: Vec::new() }
+        Self { columns, stride, normals: Vec::new(), scales: Vec::new(), supports: Vec::new() }
     }
 
     /// From `columns` values a row, one row after the other.
@@ -136,6 +142,9 @@ impl DenseRows {
         self.normals.resize(self.normals.len() + self.stride - self.columns, 0.0);
         let norm = normal.iter().map(|a| a * a).sum::<f64>().sqrt();
         self.scales.push(if norm > 0.0 { 1.0 / norm } else { 1.0 });
+        let first = normal.iter().position(|&a| a != 0.0).unwrap_or(0) / LANES * LANES;
+        let last = normal.iter().rposition(|&a| a != 0.0).map_or(0, |last| last + 1);
+        self.supports.push((first as u32, (last.div_ceil(LANES) * LANES) as u32));
     }
 
     /// Variables.
@@ -178,7 +187,13 @@ impl DenseRows {
     /// a_i z for a padded z.
     #[inline]
     pub(crate) fn product(&self, row: usize, padded: &[f64]) -> f64 {
-        lanes_dot(&self.normals[row * self.stride..][..self.stride], padded)
+        let normal = &self.normals[row * self.stride..][..self.stride];
+        if self.stride <= SHORT {
+            return lanes_dot(normal, padded);
+        }
+        let (first, end) = self.supports[row];
+        let support = first as usize..end as usize;
+        lanes_dot(&normal[support.clone()], &padded[support])
     }
 
     /// Largest (z - scale a_i) y over a box of these middles and half widths; all three padded.
@@ -228,13 +243,19 @@ impl QuadraticCost {
             return Err(NotPositiveDefinite);
         }
         let factor = hessian.clone().cholesky().ok_or(NotPositiveDefinite)?.unpack();
+        // Rows of L are columns of its transpose, and contiguous there.
+        let transposed = factor.transpose();
         let mut inverse_factor = vec![0.0; n * n];
-        // Column k of L^-T: L' x = e_k, from the last component up.
+        // Column k of L^-T: L' x = e_k, from the last component up, each one taken out of those
+        // above it as soon as it is known.
         for k in 0..n {
-            let column = &mut inverse_factor[k * n..][..n];
+            let column = &mut inverse_factor[k * n..][..=k];
+            column[k] = 1.0;
             for i in (0..=k).rev() {
-                let known: f64 = (i + 1..=k).map(|j| factor[(j, i)] * column[j]).sum();
-                column[i] = (f64::from(u8::from(i == k)) - known) / factor[(i, i)];
+                let row = &transposed.as_slice()[i * n..][..=i];
+                let value = column[i] / row[i];
+                column[i] = value;
+                column[..i].iter_mut().zip(row).for_each(|(x, l)| *x -= value * l);
             }
         }
         if !inverse_factor.iter().all(|x| x.is_finite()) {

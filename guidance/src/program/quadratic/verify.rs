@@ -105,9 +105,13 @@ pub(super) fn objective(program: &QuadraticProgram<'_>, point: &[f64]) -> f64 {
     terms.map(|(z, (h, g))| z * (0.5 * h + g)).sum()
 }
 
+/// Hz, column by column: memory is read straight, and each component is still summed in order.
 fn times_hessian(program: &QuadraticProgram<'_>, point: &[f64]) -> Vec<f64> {
-    let hessian = program.cost.hessian();
-    (0..point.len())
-        .map(|i| point.iter().enumerate().map(|(k, z)| hessian[(i, k)] * z).sum())
-        .collect()
+    let n = point.len();
+    let mut product = vec![0.0; n];
+    let columns = program.cost.hessian().as_slice().chunks_exact(n.max(1));
+    for (column, z) in columns.zip(point) {
+        product.iter_mut().zip(column).for_each(|(sum, h)| *sum += h * z);
+    }
+    product
 }

@@ -21,6 +21,8 @@ use crate::{
 impl GuidanceService for Grpc {
     type StepStreamStream =
         Pin<Box<dyn Stream<Item = Result<v1::StepStreamResponse, Status>> + Send>>;
+    type DownloadArtifactStream =
+        Pin<Box<dyn Stream<Item = Result<v1::DownloadArtifactResponse, Status>> + Send>>;
 
     async fn compute_plan(
         &self,
@@ -89,6 +91,29 @@ impl GuidanceService for Grpc {
             .map(|answer| Response::new(answer.render()))
     }
 
+    async fn list_artifacts(
+        &self,
+        request: Request<v1::ListArtifactsRequest>,
+    ) -> Result<Response<v1::ListArtifactsResponse>, Status> {
+        self.call(request, async |service: &Service, ask, call| service.artifacts(ask, &call).await)
+            .await
+            .map(|answer| Response::new(answer.render()))
+    }
+
+    async fn download_artifact(
+        &self,
+        request: Request<v1::DownloadArtifactRequest>,
+    ) -> Result<Response<Self::DownloadArtifactStream>, Status> {
+        // Large enough to be fast, small enough for every reader's limit.
+        const PIECE: usize = 256 << 10;
+        self.call(request, async |service: &Service, ask, call| service.download(ask, &call).await)
+            .await
+            .map(|answer| {
+                let pieces = answer.pieces(PIECE).map(Ok);
+                Response::new(Box::pin(stream::iter(pieces)) as Self::DownloadArtifactStream)
+            })
+    }
+
     async fn step(
         &self,
         request: Request<v1::StepRequest>,
@@ -119,6 +144,17 @@ impl GuidanceService for Grpc {
             closed_loop.next().await.map(|answer| (answer, closed_loop))
         });
         Ok(Response::new(Box::pin(answers)))
+    }
+
+    async fn safety_report(
+        &self,
+        request: Request<v1::SafetyReportRequest>,
+    ) -> Result<Response<v1::SafetyReportResponse>, Status> {
+        self.call(request, async |service: &Service, ask, call| {
+            service.safety_report(ask, &call).await
+        })
+        .await
+        .map(|timed| respond(timed.map(|answer| answer.render())))
     }
 
     async fn get_server_info(

@@ -69,9 +69,10 @@ impl Operations for Grpc {
         &self,
         request: Request<WaitOperationRequest>,
     ) -> Result<Response<Operation>, Status> {
-        let request = named(request);
-        self.call(request, async |service: &Service, ask, call| service.operation(ask, &call).await)
-            .await
-            .map(|answer| Response::new(answer.render()))
+        self.call(request, async |service: &Service, ask, call| {
+            service.wait_operation(ask, &call).await
+        })
+        .await
+        .map(|answer| Response::new(answer.render()))
     }
 }

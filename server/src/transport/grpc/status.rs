@@ -7,7 +7,11 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
 use vbar_proto::google::rpc;
 
-use crate::{service::Error, telemetry::RequestId, transport::ERROR_DOMAIN, wire::Violation};
+use crate::{
+    service::Error,
+    telemetry::RequestId,
+    wire::{ERROR_DOMAIN, Violation},
+};
 
 /// The status for `error` in the request `id`.
 pub(super) fn render(error: Error, id: &RequestId) -> Status {

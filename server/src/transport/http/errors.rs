@@ -14,7 +14,8 @@ use super::JSON;
 use crate::{
     service::{Code, Error},
     telemetry::RequestId,
-    transport::{AnsweredWith, ERROR_DOMAIN},
+    transport::AnsweredWith,
+    wire::ERROR_DOMAIN,
 };
 
 /// An error and how HTTP says it.
@@ -32,6 +33,7 @@ impl From<Error> for HttpError {
                 StatusCode::BAD_REQUEST
             }
             Code::NotFound => StatusCode::NOT_FOUND,
+            Code::AlreadyExists => StatusCode::CONFLICT,
             Code::ResourceExhausted => StatusCode::TOO_MANY_REQUESTS,
             // Nobody is left to read it; the number is the customary one.
             Code::Cancelled => StatusCode::from_u16(499).unwrap_or(StatusCode::BAD_REQUEST),
@@ -47,6 +49,16 @@ impl From<Error> for HttpError {
 impl HttpError {
     fn with(status: StatusCode, code: Code, reason: &'static str, message: String) -> Self {
         Self { status, error: Error::new(code, reason, message), allow: None }
+    }
+
+    /// The same, as a request with a `Range` header is told.
+    pub(super) fn of_a_range(error: Error) -> Self {
+        match error.code {
+            Code::OutOfRange => {
+                Self { status: StatusCode::RANGE_NOT_SATISFIABLE, error, allow: None }
+            }
+            _ => error.into(),
+        }
     }
 
     pub(super) fn too_large(largest: usize) -> Self {
@@ -70,9 +82,14 @@ impl HttpError {
         Self { status: StatusCode::METHOD_NOT_ALLOWED, error, allow: Some(allow) }
     }
 
+    /// The text of the response.
+    pub(super) fn body(&self, id: &RequestId) -> String {
+        body(&self.error, id).to_string()
+    }
+
     /// The response, for the request `id`.
     pub(super) fn render(self, id: &RequestId) -> Response {
-        let body = body(&self.error, id).to_string();
+        let body = self.body(id);
         let mut response = (self.status, [(header::CONTENT_TYPE, JSON)], body).into_response();
         response.extensions_mut().insert(AnsweredWith(self.error.code.number()));
         let headers = response.headers_mut();

@@ -1,6 +1,8 @@
 //! JSON over HTTP: the messages of the contract as canonical proto3 JSON.
 
+mod download;
 mod errors;
+mod events;
 mod json;
 mod openapi;
 
@@ -22,7 +24,7 @@ use super::{SERVER_TIMING, TransportOptions, deadline_fault, server_timing};
 use crate::{
     service::{Call, Code, Error, Service, Timed},
     telemetry::RequestId,
-    wire::{Document, NamedBy, Parse, Render, parse},
+    wire::{ArtifactCall, Document, NamedBy, Parse, Render, parse},
 };
 use errors::HttpError;
 
@@ -60,8 +62,10 @@ pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Rout
         .route("/v1/precompute", post(precompute))
         .route("/v1/operations", get(list_operations))
         .route("/v1/operations/{id}", any(operation))
+        .route("/v1/artifacts", get(list_artifacts))
         .route("/v1/artifacts/{id}", get(get_artifact))
         .route("/v1/step", post(step))
+        .route("/v1/safety:report", post(safety_report))
         .route("/v1/info", get(info))
         .route("/healthz", get(async || text(StatusCode::OK, "alive\n")))
         .route("/readyz", get(ready))
@@ -89,14 +93,8 @@ async fn upload_plan(State(http): Shared, request: Request) -> Response {
 
 async fn list_plans(State(http): Shared, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, _)| {
-        let mut message = v1::ListPlansRequest::default();
-        for (name, value) in query(&parts) {
-            match name {
-                "pageSize" | "page_size" => message.page_size = page_size(&value)?,
-                "pageToken" | "page_token" => message.page_token = value,
-                _ => return Err(Error::field("query", "pageSize, pageToken", name).into()),
-            }
-        }
+        let Page { page_size, page_token } = page(&parts)?;
+        let message = v1::ListPlansRequest { page_size, page_token };
         let (ask, call) = http.parsed(&parts, &message)?;
         Ok(rendered(&http.service.kept_plans(ask, &call).await?))
     })
@@ -137,15 +135,44 @@ async fn step(State(http): Shared, request: Request) -> Response {
     .await
 }
 
+async fn safety_report(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, body)| {
+        let (ask, call) = http.message::<_, v1::SafetyReportRequest>(&parts, body).await?;
+        Ok(timed(http.service.safety_report(ask, &call).await?))
+    })
+    .await
+}
+
+/// `GET /v1/artifacts/{id}` and `GET /v1/artifacts/{id}:download`.
 async fn get_artifact(
     State(http): Shared,
-    Path(artifact_id): Path<String>,
+    Path(segment): Path<String>,
     request: Request,
 ) -> Response {
     http.call(request, async |http: &Http, (parts, _)| {
         no_query(&parts)?;
-        let (ask, call) = http.parsed(&parts, &v1::GetArtifactRequest { artifact_id })?;
-        Ok(rendered(&http.service.artifact(ask, &call).await?))
+        match segment.strip_suffix(":download") {
+            None => {
+                let message = v1::GetArtifactRequest { artifact_id: segment };
+                let (ask, call) = http.parsed(&parts, &message)?;
+                Ok(rendered(&http.service.artifact(ask, &call).await?))
+            }
+            Some(id) => {
+                let message = v1::GetArtifactRequest { artifact_id: id.to_owned() };
+                let (ArtifactCall { id }, call) = http.parsed(&parts, &message)?;
+                download::answer(&http.service, id, &parts.headers, &call).await
+            }
+        }
+    })
+    .await
+}
+
+async fn list_artifacts(State(http): Shared, request: Request) -> Response {
+    http.call(request, async |http: &Http, (parts, _)| {
+        let Page { page_size, page_token } = page(&parts)?;
+        let message = v1::ListArtifactsRequest { page_size, page_token };
+        let (ask, call) = http.parsed(&parts, &message)?;
+        Ok(rendered(&http.service.artifacts(ask, &call).await?))
     })
     .await
 }
@@ -168,13 +195,14 @@ async fn list_operations(State(http): Shared, request: Request) -> Response {
     .await
 }
 
-/// `GET` and `DELETE /v1/operations/{id}`, `POST /v1/operations/{id}:wait` and `:cancel`.
+/// `GET` and `DELETE /v1/operations/{id}`, `POST /v1/operations/{id}:wait` and `:cancel`,
+/// `GET /v1/operations/{id}:watch`.
 ///
 /// The router takes whole segments only, so the verb and what it allows are told apart here.
 async fn operation(State(http): Shared, Path(segment): Path<String>, request: Request) -> Response {
     http.call(request, async |http: &Http, (parts, body)| {
         let (id, verb) = match segment.rsplit_once(':') {
-            Some((id, verb @ ("wait" | "cancel"))) => (id, verb),
+            Some((id, verb @ ("wait" | "cancel" | "watch"))) => (id, verb),
             _ => (segment.as_str(), ""),
         };
         let by_name = NamedBy::operation(id);
@@ -192,18 +220,30 @@ async fn operation(State(http): Shared, Path(segment): Path<String>, request: Re
             }
             (&Method::POST, "wait") => {
                 no_query(&parts)?;
-                http.optional_message::<longrunning::WaitOperationRequest>(&parts, body).await?;
-                let (ask, call) = http.parsed(&parts, &by_name)?;
-                Ok(rendered(&http.service.operation(ask, &call).await?))
+                let message: Option<longrunning::WaitOperationRequest> =
+                    http.optional_message(&parts, body).await?;
+                let message = longrunning::WaitOperationRequest {
+                    name: format!("operations/{id}"),
+                    ..message.unwrap_or_default()
+                };
+                let (ask, call) = http.parsed(&parts, &message)?;
+                Ok(rendered(&http.service.wait_operation(ask, &call).await?))
             }
             (&Method::POST, "cancel") => {
                 no_query(&parts)?;
-                http.optional_message::<longrunning::CancelOperationRequest>(&parts, body).await?;
+                let _: Option<longrunning::CancelOperationRequest> =
+                    http.optional_message(&parts, body).await?;
                 let (ask, call) = http.parsed(&parts, &by_name)?;
                 http.service.cancel_operation(ask, &call).await?;
                 Ok(empty())
             }
+            (&Method::GET, "watch") => {
+                no_query(&parts)?;
+                let (ask, _) = http.parsed(&parts, &by_name)?;
+                Ok(events::answer(http.service.watch_operation(ask)?))
+            }
             (_, "") => Err(HttpError::method_not_allowed("GET,HEAD,DELETE")),
+            (_, "watch") => Err(HttpError::method_not_allowed("GET")),
             _ => Err(HttpError::method_not_allowed("POST")),
         }
     })
@@ -275,19 +315,17 @@ impl Http {
         self.parsed(parts, &json::decode::<M>(&bytes)?)
     }
 
-    /// A message of which nothing is needed, and which may be left out; if it is there, it must
-    /// be one.
-    async fn optional_message<M>(&self, parts: &Parts, body: Body) -> Result<(), HttpError>
+    /// A message that may be left out; if it is there, it must be one.
+    async fn optional_message<M>(&self, parts: &Parts, body: Body) -> Result<Option<M>, HttpError>
     where
         M: Message + Name + Default,
     {
         let bytes = self.body(&parts.headers, body).await?;
         if bytes.is_empty() {
-            return Ok(());
+            return Ok(None);
         }
         is_json(&parts.headers)?;
-        json::decode::<M>(&bytes)?;
-        Ok(())
+        Ok(Some(json::decode(&bytes)?))
     }
 
     /// Checks a message and reads what every call brings.
@@ -390,6 +428,25 @@ fn decoded(value: &str) -> String {
 
 fn page_size(value: &str) -> Result<i32, HttpError> {
     value.parse().map_err(|_| Error::field("page_size", "an integer, at least 0", value).into())
+}
+
+/// Which page of a list.
+struct Page {
+    page_size: i32,
+    page_token: String,
+}
+
+/// `?pageSize=…&pageToken=…`, also in snake case.
+fn page(parts: &Parts) -> Result<Page, HttpError> {
+    let mut page = Page { page_size: 0, page_token: String::new() };
+    for (name, value) in query(parts) {
+        match name {
+            "pageSize" | "page_size" => page.page_size = page_size(&value)?,
+            "pageToken" | "page_token" => page.page_token = value,
+            _ => return Err(Error::field("query", "pageSize, pageToken", name).into()),
+        }
+    }
+    Ok(page)
 }
 
 /// `?pageSize=…&pageToken=…&filter=…`, also in snake case.

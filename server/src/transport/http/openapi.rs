@@ -26,7 +26,7 @@ enum Body {
     Optional,
 }
 
-const ROUTES: [Route; 14] = [
+const ROUTES: [Route; 18] = [
     route("post", "/v1/plans:compute", "vbar.v1.GuidanceService.ComputePlan", Body::Required),
     route("post", "/v1/plans", "vbar.v1.GuidanceService.UploadPlan", Body::Required),
     bare("get", "/v1/plans", "vbar.v1.GuidanceService.ListPlans"),
@@ -34,10 +34,14 @@ const ROUTES: [Route; 14] = [
     bare("get", EXPORT, "vbar.v1.GuidanceService.ExportPlan"),
     route("post", "/v1/precompute", "vbar.v1.GuidanceService.Precompute", Body::Required),
     route("post", "/v1/step", "vbar.v1.GuidanceService.Step", Body::Required),
+    route("post", "/v1/safety:report", "vbar.v1.GuidanceService.SafetyReport", Body::Required),
     bare("get", "/v1/info", "vbar.v1.GuidanceService.GetServerInfo"),
+    bare("get", ARTIFACTS, "vbar.v1.GuidanceService.ListArtifacts"),
     bare("get", "/v1/artifacts/{id}", "vbar.v1.GuidanceService.GetArtifact"),
+    bare("get", DOWNLOAD, "vbar.v1.GuidanceService.DownloadArtifact"),
     bare("get", "/v1/operations", "google.longrunning.Operations.ListOperations"),
     bare("get", "/v1/operations/{id}", "google.longrunning.Operations.GetOperation"),
+    bare("get", WATCH, "google.longrunning.Operations.GetOperation"),
     bare("delete", "/v1/operations/{id}", "google.longrunning.Operations.DeleteOperation"),
     route(
         "post",
@@ -55,6 +59,11 @@ const ROUTES: [Route; 14] = [
 
 /// Answered by the document itself.
 const EXPORT: &str = "/v1/plans/{id}:export";
+/// Answered by the bytes themselves.
+const DOWNLOAD: &str = "/v1/artifacts/{id}:download";
+/// Answered by events.
+const WATCH: &str = "/v1/operations/{id}:watch";
+const ARTIFACTS: &str = "/v1/artifacts";
 
 const fn route(method: &'static str, path: &'static str, rpc: &'static str, body: Body) -> Route {
     Route { method, path, rpc, body: Some(body) }
@@ -154,7 +163,8 @@ fn operation(route: &Route, schemas: &mut Schemas) -> Value {
     if route.path.contains("{id}") {
         parameters.push(json!({ "$ref": "#/components/parameters/id" }));
     }
-    if route.path == "/v1/operations" || (route.path == "/v1/plans" && route.method == "get") {
+    let is_list = ["/v1/operations", "/v1/plans", ARTIFACTS].contains(&route.path);
+    if is_list && route.method == "get" {
         for (name, schema) in [
             ("pageSize", json!({ "type": "integer", "minimum": 0, "maximum": i32::MAX })),
             ("pageToken", json!({ "type": "string", "pattern": "^([0-9a-f]{64})?$" })),
@@ -162,12 +172,20 @@ fn operation(route: &Route, schemas: &mut Schemas) -> Value {
             parameters.push(json!({ "name": name, "in": "query", "schema": schema }));
         }
     }
+    if route.path == "/v1/operations" {
+        let schema = json!({ "type": "string" });
+        parameters.push(json!({ "name": "filter", "in": "query", "schema": schema }));
+    }
     if route.path == EXPORT {
         parameters.extend(export_parameters());
     }
+    if route.path == DOWNLOAD {
+        let schema = json!({ "type": "string", "pattern": "^bytes=[0-9]*-[0-9]*$" });
+        parameters.push(json!({ "name": "Range", "in": "header", "schema": schema }));
+    }
     let comments = Comments::of(&rpc.parent_file());
     let mut operation = json!({
-        "operationId": rpc.name(),
+        "operationId": if route.path == WATCH { "WatchOperation" } else { rpc.name() },
         "description": comments.at(rpc.path()),
         "parameters": parameters,
         "responses": responses(route, schemas.reference(&rpc.output())),
@@ -203,19 +221,20 @@ fn responses(route: &Route, answer: Value) -> Value {
         responses
             .insert(code.to_owned(), json!({ "description": description, "content": content }));
     };
-    if route.path != EXPORT {
+    if ![EXPORT, DOWNLOAD, WATCH].contains(&route.path) {
         add("200", "The answer; an infeasible problem is one too.", &answer);
     }
     let status = json!({ "$ref": "#/components/schemas/google.rpc.Status" });
     let mut errors = vec![
         ("400", "The request is at fault; every faulty field is named."),
         ("405", "The path exists, but not for this method."),
-        ("429", "Every compute thread is busy; the details say when to ask again."),
+        ("429", "A limit of the server is reached; the details say when to ask again."),
         ("500", "A bug of the server; the request id finds it in the log."),
         ("503", "The artifact store does not answer, or the server is shutting down."),
         ("504", "No certified answer was found before the deadline."),
     ];
-    if route.path.contains("{id}") || route.path == "/v1/step" {
+    let names_one = ["/v1/step", "/v1/safety:report"].contains(&route.path);
+    if route.path.contains("{id}") || names_one {
         errors.push(("404", "There is no such artifact, plan or operation."));
     }
     if route.body.is_some() {
@@ -223,21 +242,36 @@ fn responses(route: &Route, answer: Value) -> Value {
         errors.push(("413", "The body is too large."));
         errors.push(("415", "The body is not plain JSON."));
     }
-    if route.method == "delete" {
-        errors.push(("501", "An operation has no record apart from its artifact."));
+    if route.path == "/v1/precompute" {
+        errors.push(("409", "The request id came with another problem before."));
+    }
+    if route.path == DOWNLOAD {
+        errors.push(("416", "No byte of the artifact is in the range."));
     }
     for (code, description) in errors {
         add(code, description, &status);
     }
-    if route.path == EXPORT {
-        let document = json!({ "schema": { "type": "string" } });
-        let content = json!({
-            "text/plain": document,
-            "text/csv": document,
-            "application/octet-stream": document,
-        });
-        let ok = json!({ "description": "The document itself.", "content": content });
-        responses.insert("200".to_owned(), ok);
+    let mut add_text = |code: &str, description: &str, types: &[&str]| {
+        let text = json!({ "schema": { "type": "string" } });
+        let content: Map<_, _> = types.iter().map(|t| ((*t).to_owned(), text.clone())).collect();
+        let ok = json!({ "description": description, "content": content });
+        responses.insert(code.to_owned(), ok);
+    };
+    match route.path {
+        EXPORT => {
+            let types = ["text/plain", "text/csv", "application/octet-stream"];
+            add_text("200", "The document itself.", &types);
+        }
+        DOWNLOAD => {
+            add_text("200", "The bytes; their sha256 is the ETag.", &["application/octet-stream"]);
+            add_text("206", "The bytes in the range.", &["application/octet-stream"]);
+        }
+        WATCH => {
+            let events = "Events `progress`, at most five a second, and `done` at the end, each \
+                          with the operation as JSON.";
+            add_text("200", events, &["text/event-stream"]);
+        }
+        _ => {}
     }
     Value::Object(responses)
 }
@@ -277,6 +311,9 @@ impl Schemas {
             "google.protobuf.Empty" => return json!({ "type": "object" }),
             "google.protobuf.Duration" => {
                 return json!({ "type": "string", "pattern": "^[0-9]{1,9}([.][0-9]{1,9})?s$" });
+            }
+            "google.protobuf.Timestamp" => {
+                return json!({ "type": "string", "format": "date-time" });
             }
             "google.protobuf.Any" => {
                 return json!({

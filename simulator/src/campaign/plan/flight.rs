@@ -245,7 +245,7 @@ fn draw_unit(law: NoiseLaw, chance: &mut impl Rng) -> Vector6<f64> {
 }
 
 /// Box and Muller.
-fn standard_normal(chance: &mut impl Rng) -> f64 {
+pub(crate) fn standard_normal(chance: &mut impl Rng) -> f64 {
     let (uniform, angle) = (1.0 - chance.random::<f64>(), chance.random::<f64>());
     (-2.0 * uniform.ln()).sqrt() * (std::f64::consts::TAU * angle).cos()
 }
@@ -263,7 +263,7 @@ fn seen(pair: &TwoBody) -> Vector6<f64> {
 
 /// Computes elsewhere, so that answers are not kept waiting by it: an hour of orbit takes
 /// milliseconds.
-async fn aside<T: Send + 'static>(
+pub(crate) async fn aside<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, SimulationError> {
     Ok(tokio::task::spawn_blocking(work).await?)

@@ -1,0 +1,116 @@
+//! The threads that do jobs. They are their own, so that no number of jobs takes a thread from
+//! steps; how many there are decides how much of the machine jobs may have.
+
+use std::{
+    io,
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{Arc, atomic::Ordering},
+    thread,
+    time::Instant,
+};
+
+use vbar_guidance::{Budget, Interruption, Progress};
+
+use super::{
+    Ending, Inner, Stopped, Work,
+    board::{RunKey, Turn},
+};
+use crate::{
+    compute::{ComputeError, panic_text},
+    service::Error,
+    store::Ledger,
+    wire::ArtifactId,
+};
+
+/// Starts the threads; they end when the board is closed.
+pub(super) fn start<W: Work>(inner: &Arc<Inner<W>>) -> io::Result<()> {
+    for number in 0..inner.limits.threads {
+        let inner = Arc::clone(inner);
+        thread::Builder::new().name(format!("job-{number}")).spawn(move || inner.work())?;
+    }
+    Ok(())
+}
+
+impl<W: Work> Inner<W> {
+    /// Body of a thread.
+    fn work(&self) {
+        while let Some(turn) = self.next_turn() {
+            if turn.is_first {
+                self.write_down_begin(turn.id, &turn.run);
+            }
+            if let Some(ending) = self.run(&turn) {
+                // A thread's end of a job is always taken in, written down or not.
+                let _ = self.end(turn.id, Some(&turn.run), ending);
+            }
+        }
+    }
+
+    /// Waits for a shard; `None` when the node ends.
+    fn next_turn(&self) -> Option<Turn<W>> {
+        let mut board = self.board();
+        loop {
+            if board.is_closed() {
+                return None;
+            }
+            if let Some(turn) = board.take(self.limits.time_max) {
+                return Some(turn);
+            }
+            board = self.ready.wait(board).unwrap_or_else(std::sync::PoisonError::into_inner);
+        }
+    }
+
+    /// Counts the attempt before anything can go wrong in it.
+    fn write_down_begin(&self, id: ArtifactId, run: &RunKey) {
+        let _journal = self.journal();
+        let Some((record, revision)) = self.board().unfinished_record(&id, Some(run)) else {
+            return;
+        };
+        match self.store.write(Ledger::Jobs, &id.0, record.encode().into(), revision) {
+            Ok(revision) => self.board().set_revision(&id, revision),
+            Err(fault) => tracing::error!(%id, %fault, "the start of a job was not written down"),
+        }
+    }
+
+    /// Computes a shard, and finishes the job with the last one. How the job ended, if it did.
+    fn run(&self, turn: &Turn<W>) -> Option<Ending> {
+        let stop = || {
+            if turn.run.load(Ordering::Relaxed) {
+                Some(Interruption::Cancelled)
+            } else if Instant::now() >= turn.deadline {
+                Some(Interruption::Deadline)
+            } else {
+                None
+            }
+        };
+        let start = Instant::now();
+        let tell = |progress: Progress| turn.told.shard(turn.shard, progress);
+        let budget = Budget::new(&stop);
+        let shard = caught(|| turn.work.run_shard(turn.shard, budget.telling(&tell)));
+        self.metrics.job_shard_seconds.observe(start.elapsed().as_secs_f64());
+        // Cancelled or handed back: its end is written by whoever stopped it.
+        if turn.run.load(Ordering::Relaxed) {
+            return None;
+        }
+        let ended = match shard {
+            Ok(shard) => {
+                let shards = self.board().deliver(turn, shard)?;
+                let tell = |progress: Progress| turn.told.merge(progress);
+                caught(|| turn.work.finish(shards, budget.telling(&tell)))
+            }
+            Err(stopped) => Err(stopped),
+        };
+        // Stopped while it was merged: as above.
+        let is_stopped = ended.is_err() && turn.run.load(Ordering::Relaxed);
+        (!is_stopped).then(|| ended.map_or_else(Ending::from, |()| Ending::Made))
+    }
+}
+
+/// A panic is one failed job: it is repeated exactly whenever the job is.
+fn caught<T>(work: impl FnOnce() -> Result<T, Stopped>) -> Result<T, Stopped> {
+    // Nothing survives a panic but the message: shards are only read, and a job that ends so
+    // delivers nothing.
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
+        let error = Error::from(ComputeError::Panicked(panic_text(&*panic)));
+        Err(Stopped::Failed(error.into()))
+    })
+}
