@@ -104,10 +104,11 @@ async fn load(client: Client, missions: Arc<Missions>, seen: Shared, seed: u64) 
         assert!(answer.certificate.is_some_and(|certificate| certificate.passed));
         // Before it decided the step it kept the controller.
         let provenance = answer.provenance.unwrap();
-        let mut seen_now = seen.lock().unwrap();
-        seen_now.steps += 1;
-        seen_now.artifacts.insert(provenance.artifact_id, provenance.content_sha256);
-        drop(seen_now);
+        {
+            let mut seen = seen.lock().unwrap();
+            seen.steps += 1;
+            seen.artifacts.insert(provenance.artifact_id, provenance.content_sha256);
+        }
         if count % 4 == 0 {
             let problem = Some(varied(&missions.plan, variant));
             let request = ComputePlanRequest { problem, ..ComputePlanRequest::default() };

@@ -426,7 +426,7 @@ mod tests {
         let offsets = |problem: &v1::OfflineSamplingProblem| {
             problem.input_set.as_ref().expect("a set").offsets.clone()
         };
-        assert_eq!(offsets(robust), [0.1; 4]);
+        assert_eq!(offsets(robust), [0.15; 4]);
         assert_eq!(offsets(offline_sampling(&mission.problem).expect("the arm")), [0.3; 4]);
     }
 

@@ -13,7 +13,12 @@ use vbar_server::{Config, Node};
 
 /// A node of one's own and a client of it.
 async fn node() -> (Node, Client) {
-    let node = Node::start(Config::default()).await.expect("a node");
+    node_with(Config::default()).await
+}
+
+/// The same with other settings.
+async fn node_with(config: Config) -> (Node, Client) {
+    let node = Node::start(config).await.expect("a node");
     let url = format!("http://{}", node.local_address());
     let client = Client::connect(&url, vbar_client::Options::default()).await.expect("a client");
     (node, client)

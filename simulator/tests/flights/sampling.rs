@@ -1,13 +1,16 @@
 //! Loops under sampled chance constraints: precomputed once, flown from every start.
 
+use std::time::Duration;
+
 use serde_json::{Value, json};
 use vbar_proto::v1::OfflineSamplingScheme as Scheme;
+use vbar_server::Config;
 use vbar_simulator::{
     Progress, SamplingCampaign, SamplingMission, SamplingReport, SamplingRunOptions,
     SamplingSchemeChoice, Silent, SimulationError, draw_sampling, fly_sampling,
 };
 
-use super::{mission_text, node};
+use super::{mission_text, node_with};
 
 /// Few enough samples that a test need not wait for them; what is promised for many is not.
 const FEW_SAMPLES: i32 = 60;
@@ -34,7 +37,11 @@ async fn try_fly(
     options: SamplingRunOptions,
     progress: &dyn Progress,
 ) -> Result<SamplingReport, SimulationError> {
-    let (node, client) = node().await;
+    // Whoever shares the machine may take most of it.
+    let patience = Duration::from_secs(300);
+    let config = Config { computation_time_max: patience, ..Config::default() };
+    let (node, client) = node_with(config).await;
+    let client = client.with_deadline(patience);
     let report = fly_sampling(&client, mission, &options, progress).await;
     node.shutdown().await;
     report
