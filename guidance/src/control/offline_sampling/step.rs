@@ -282,7 +282,7 @@ fn missed_steps(
     };
     let late = elapsed.seconds() / sample_time - step as f64;
     let whole = libm::round(late);
-    if whole >= 0.0 && whole < 1e9 && (late - whole).abs() <= EPOCH_TOLERANCE {
+    if (0.0..1e9).contains(&whole) && (late - whole).abs() <= EPOCH_TOLERANCE {
         return Ok(whole as usize);
     }
     let expected = format!("{} or a whole number of steps later", step as f64 * sample_time);
