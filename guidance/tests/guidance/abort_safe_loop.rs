@@ -116,14 +116,14 @@ fn first_step(problem: &Problem, x: &RelativeVector) -> Step {
 }
 
 #[test]
-fn station_is_reached_through_every_phase_and_could_be_left_at_every_step() {
+fn station_is_reached_through_every_phase_and_no_failure_on_the_way_is_fatal() {
     let problem = station(549);
     let artifact = Artifact::prepare(&problem).unwrap();
     let plant = PeriodicPlant::new(&problem.orbit, problem.mass, problem.sample_time, 1, 1);
     let mut state = AbortSafe::start(&artifact);
     let mut x = start();
     let mut phases = vec![0];
-    let mut softened = 0;
+    let (mut softened, mut asked, mut open) = (0, 0, 0);
     for k in 0..200 {
         let answer = step(&artifact, &state, &at(&x));
         if answer.phase != phases[phases.len() - 1] {
@@ -132,15 +132,27 @@ fn station_is_reached_through_every_phase_and_could_be_left_at_every_step() {
         match &answer.verdict {
             Verdict::Command(command) => {
                 assert!(answer.certificate.as_ref().unwrap().passed, "{answer:?}");
-                // Even where a half-space had to give way, every failure can be survived.
-                let safe = answer.safety.as_ref().is_none_or(|s| s.abort_always_exists());
-                assert!(safe, "step {k}: {:?}", answer.diagnostics);
+                // Even where a half-space had to give way, no failure is proved to be fatal. Samples
+                // 30 s apart are coarse for a 40 m box: a sequence that is outside at all of them
+                // can cut a corner between two, and a verdict stays open.
+                for mode in answer.safety.iter().flat_map(|safety| &safety.modes) {
+                    asked += 1;
+                    match &mode.abort {
+                        AbortVerdict::Found(abort) => assert!(abort.margin > 0.0, "step {k}"),
+                        AbortVerdict::NoneProved { .. } => panic!("step {k}: {mode:?}"),
+                        AbortVerdict::Undecided { .. } => open += 1,
+                    }
+                }
                 softened += usize::from(command.softened);
                 x = plant.advance(k, &x, &command.force_n);
             }
             Verdict::Arrived(arrival) => {
                 assert_eq!(arrival.completion_steps, k);
-                println!("station reached after {k} steps, {softened} of them softened");
+                println!(
+                    "station reached after {k} steps, {softened} of them softened; {open} of \
+                     {asked} verdicts on failures open"
+                );
+                assert!(open * 4 < asked, "{open} of {asked} verdicts open");
                 assert_eq!((phases.as_slice(), softened <= 2), ([0, 1, 2, 3].as_slice(), true));
                 return;
             }

