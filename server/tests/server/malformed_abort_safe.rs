@@ -259,7 +259,10 @@ async fn malformed_abort_safe_weights_are_named() {
     let mut lopsided = vec![0.0; 36];
     (0..6).for_each(|i| lopsided[7 * i] = 1.0);
     lopsided[1] = 0.5;
-    let matrix = |rows: i32, values: Vec<f64>| json!({ "matrix": { "rows": rows, "columns": 6, "values": values } });
+    let matrix = |rows: i32, values: Vec<f64>| {
+        let matrix = json!({ "rows": rows, "columns": 6, "values": values });
+        json!({ "matrix": matrix })
+    };
     let diagonal = |values: Vec<f64>| json!({ "diagonal": { "values": values } });
     check(
         &server,

@@ -234,8 +234,9 @@ async fn safety_report_that_does_not_fit_is_named() {
     ] {
         refused(&server, request, &[field]).await;
     }
-    let other = server.post("/v1/precompute", &json!({ "problem": double_integrator() })).await;
-    let other = other.json()["response"]["artifact"]["artifactId"].clone();
+    let linear = json!({ "linear": { "components": [20.0, 0.0] } });
+    let step = json!({ "problem": double_integrator(), "measurement": linear });
+    let other = server.post("/v1/step", &step).await.json()["provenance"]["artifactId"].clone();
     refused(&server, json!({ "artifactId": other, "states": states(1) }), &["artifact_id"]).await;
     let unknown = json!({ "artifactId": "0".repeat(64), "states": states(1) });
     assert_eq!(server.post("/v1/safety:report", &unknown).await.status, 404);
