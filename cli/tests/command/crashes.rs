@@ -10,7 +10,7 @@ use std::{
 use vbar_client::{
     Client, Options,
     v1::{
-        ComputePlanRequest, Measurement, Problem, StepRequest, problem::Method,
+        ComputePlanRequest, Measurement, Problem, Provenance, StepRequest, problem::Method,
         step_request::Controller,
     },
 };
@@ -32,6 +32,15 @@ struct Acknowledged {
 }
 
 impl Acknowledged {
+    fn count(&self) -> u64 {
+        self.operations.len() as u64 + self.plans.len() as u64 + self.steps
+    }
+
+    fn stepped(&mut self, by: Provenance) {
+        self.steps += 1;
+        self.artifacts.insert(by.artifact_id, by.content_sha256);
+    }
+
     fn take_in(&mut self, later: Self) {
         self.operations.extend(later.operations);
         self.plans.extend(later.plans);
@@ -103,12 +112,7 @@ async fn load(client: Client, missions: Arc<Missions>, seen: Shared, seed: u64) 
         let Ok(answer) = client.step(step).await else { return };
         assert!(answer.certificate.is_some_and(|certificate| certificate.passed));
         // Before it decided the step it kept the controller.
-        let provenance = answer.provenance.unwrap();
-        {
-            let mut seen = seen.lock().unwrap();
-            seen.steps += 1;
-            seen.artifacts.insert(provenance.artifact_id, provenance.content_sha256);
-        }
+        seen.lock().unwrap().stepped(answer.provenance.unwrap());
         if count % 4 == 0 {
             let problem = Some(varied(&missions.plan, variant));
             let request = ComputePlanRequest { problem, ..ComputePlanRequest::default() };
@@ -167,7 +171,12 @@ async fn node_killed_at_any_moment_loses_nothing_it_acknowledged() {
         let seen = Shared::default();
         let load = load(client, Arc::clone(&missions), Arc::clone(&seen), crash.into());
         let load = tokio::spawn(load);
-        tokio::time::sleep(Duration::from_millis(100 + chance(&mut random) % 400)).await;
+        // At least an operation, a step and a plan, on however slow a machine.
+        let enough = 3 + chance(&mut random) % 30;
+        while seen.lock().unwrap().count() < enough && !load.is_finished() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        tokio::time::sleep(Duration::from_millis(chance(&mut random) % 50)).await;
         node.child.kill().unwrap();
         node.child.wait().unwrap();
         load.await.unwrap();
@@ -185,7 +194,8 @@ async fn node_killed_at_any_moment_loses_nothing_it_acknowledged() {
         plans.len(),
         artifacts.len()
     );
-    assert!(operations.len() >= crashes as usize && !plans.is_empty());
+    let least = crashes as usize;
+    assert!(operations.len() >= least && plans.len() >= least && steps >= u64::from(crashes));
 }
 
 /// Waits for every operation, and notes what each made.

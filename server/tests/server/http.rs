@@ -166,7 +166,7 @@ async fn http_openapi_lists_every_route_and_only_those() {
     let document = server.get("/openapi.json").await.json();
     assert_eq!(document["openapi"], "3.1.0");
     let paths = document["paths"].as_object().unwrap();
-    assert_eq!(paths.len(), 17);
+    assert_eq!(paths.len(), 20);
     let id = "0".repeat(64);
     for (path, methods) in paths {
         for method in methods.as_object().unwrap().keys() {
