@@ -120,7 +120,7 @@ mod tests {
 
     use super::*;
 
-    fn has(points: &Points, expected: &[(f64, f64)]) {
+    fn has(points: &[(f64, f64)], expected: &[(f64, f64)]) {
         let near = |a: &(f64, f64), b: &(f64, f64)| (a.0 - b.0).hypot(a.1 - b.1) < 1e-9;
         assert_eq!(points.len(), expected.len(), "{points:?}");
         assert!(expected.iter().all(|e| points.iter().any(|p| near(p, e))), "{points:?}");

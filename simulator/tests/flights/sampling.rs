@@ -72,8 +72,8 @@ async fn poseidyn_docks_with_the_published_effort() {
         assert_eq!((summary.docked, summary.flights), (4, 4), "{start}: {summary:?}");
         assert_eq!((summary.input_violations, summary.uncertified_steps), (0, 0), "{start}");
         let mean = summary.control_effort_ns.expect("docked").mean;
-        // Four flights of an effort that scatters by 5 %.
-        assert!((mean / effort - 1.0).abs() < 0.1, "{start}: {mean} N s");
+        // The mean of four efforts that scatter by up to 0.3 N s: four standard errors.
+        assert!((mean - effort).abs() < 0.6, "{start}: {mean} N s");
         let time = summary.time_to_dock_s.expect("docked");
         assert!(time.min >= 140.0 && time.max <= 210.0, "{start}: {time:?}");
     }

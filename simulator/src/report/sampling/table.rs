@@ -2,6 +2,8 @@
 
 use std::fmt::Write as _;
 
+use vbar_proto::v1::OfflineSamplingScheme as Scheme;
+
 use super::{SamplingReport, SamplingSummary, Statistics};
 use crate::{
     campaign::sampling::SamplingCampaign,
@@ -49,7 +51,7 @@ fn controller(report: &SamplingReport, campaign: &SamplingCampaign) -> String {
     let all = report.summary(campaign, None);
     rows.push(row("all", &all));
     let mut text = format!("{name}\n{}", align(&rows));
-    if artifact.sampled_rows > 0 {
+    if campaign.scheme == Scheme::OfflineSampling {
         let confidence = artifact.joint_confidence.map_or_else(
             || "none, the sample size is not the bound's".to_owned(),
             |confidence| format!("{confidence}"),
