@@ -205,7 +205,8 @@ impl From<ComputeError> for Error {
             ComputeError::Deadline => Self::new(
                 Code::DeadlineExceeded,
                 "DEADLINE_EXCEEDED",
-                "no certified answer was found before the deadline",
+                "no certified answer was found before the deadline; a problem that takes longer is \
+                 for Precompute, whose artifact steps can name",
             ),
             ComputeError::Panicked(what) => Self::internal("PANIC", &what),
         }

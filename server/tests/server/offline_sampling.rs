@@ -461,6 +461,16 @@ async fn sampling_bytes_do_not_depend_on_threads() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn sampling_step_with_a_long_precompute_points_to_precompute() {
+    let computation_time_max = std::time::Duration::from_millis(20);
+    let server = server_with(Config { computation_time_max, ..Config::default() }).await;
+    let request = json!({ "problem": poseidyn(), "measurement": linear(&[0.5, 0.5, 0.0, 0.0]) });
+    let error = server.post("/v1/step", &request).await.json();
+    assert_eq!(error["code"], 4, "{error}");
+    assert!(error["message"].as_str().unwrap().contains("Precompute"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn sampling_has_no_plan_to_compute() {
     let server = server().await;
     let request = json!({ "problem": integrator() });
