@@ -445,7 +445,12 @@ async fn sampling_stream_answers_in_order() {
 async fn sampling_bytes_do_not_depend_on_threads() {
     let mut contents = Vec::new();
     for compute_threads in [1, 2] {
-        let server = server_with(Config { compute_threads, ..Config::default() }).await;
+        let server = server_with(Config {
+            compute_threads,
+            job_threads: compute_threads,
+            ..Config::default()
+        })
+        .await;
         for problem in [integrator(), poseidyn()] {
             let artifact = precompute(&server, &problem).await;
             contents.push(artifact.provenance.unwrap().content_sha256);

@@ -17,7 +17,7 @@ use vbar_proto::{
 use vbar_server::{Config, Node, StartError, StoreLocation};
 
 use crate::{
-    missions,
+    missions, offline_sampling,
     support::{Answer, Server, detail, server, server_with},
 };
 
@@ -65,10 +65,11 @@ pub(crate) fn numbered(number: u32) -> Value {
     problem
 }
 
-/// A plan of so many burns with so little thrust that it takes many seconds.
+/// So many samples that it takes minutes.
 fn slow() -> Value {
-    let mut problem = missions::prisma_6000_s(0.2);
-    problem["disturbanceFeedback"]["instants"]["equalTime"]["count"] = 48.into();
+    let mut problem = offline_sampling::poseidyn();
+    problem["offlineSampling"]["horizon"] = 10.into();
+    problem["offlineSampling"]["samples"]["size"] = 5000.into();
     problem
 }
 
