@@ -149,6 +149,7 @@ fn chance(state: &mut u64) -> u64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[allow(clippy::print_stdout, reason = "what survived is the result")]
 async fn node_killed_at_any_moment_loses_nothing_it_acknowledged() {
     let crashes = number("VBAR_CRASHES", CRASHES);
     let mut random = u64::from(number("VBAR_SEED", 1));

@@ -287,7 +287,7 @@ impl Service {
             Some(Ending::Failed(failure)) => Some(OperationOutcome::Failed(failure)),
             Some(Ending::Cancelled) => Some(OperationOutcome::Failed(wire::Failure::cancelled())),
         };
-        Ok(OperationAnswer::Precompute { progress, outcome })
+        Ok(OperationAnswer::Precompute { progress: Box::new(progress), outcome })
     }
 
     async fn made(&self, id: ArtifactId, call: &Call) -> Result<OperationOutcome, Error> {

@@ -289,7 +289,7 @@ pub(crate) enum OperationAnswer {
     /// The problem was only checked: nothing was started that could be asked for.
     Validated { id: ArtifactId },
     /// A precompute; without an outcome it is under way.
-    Precompute { progress: Progress, outcome: Option<OperationOutcome> },
+    Precompute { progress: Box<Progress>, outcome: Option<OperationOutcome> },
 }
 
 /// What came of an operation.

@@ -49,6 +49,7 @@ fn eccentric(horizon: i64, samples_a_period: f64) -> Value {
 /// The independent implementation's verdicts on membership and on aborts (by an integer program):
 /// two states are outside every set, and no abort exists. It looks at samples only; the service
 /// wants an abort to keep out between them too, and may give up on one. Golden data member_8.
+#[allow(clippy::print_stdout, reason = "the share of open questions is a figure")]
 #[tokio::test(flavor = "multi_thread")]
 async fn safety_report_tells_membership_from_the_lack_of_an_abort() {
     let path =

@@ -118,7 +118,7 @@ impl Cone {
             return None;
         };
         let finite = [x, y, axis_deg].iter().all(|value| value.is_finite());
-        if !finite || !(half_angle_deg > 0.0 && half_angle_deg < 90.0) {
+        if !(finite && half_angle_deg > 0.0 && half_angle_deg < 90.0) {
             faults.push(format!("{place}: finite, half angle between 0 and 90"));
             return None;
         }

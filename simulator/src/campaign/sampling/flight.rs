@@ -249,7 +249,7 @@ struct Session {
 }
 
 enum Decision {
-    Command(StepResponse, Duration),
+    Command(Box<StepResponse>, Duration),
     Infeasible(String),
 }
 
@@ -270,7 +270,9 @@ impl Session {
             return Err(answer(format!("step {k} was answered as {}", response.step_index)));
         }
         match &response.verdict {
-            Some(step_response::Verdict::Command(_)) => Ok(Decision::Command(response, latency)),
+            Some(step_response::Verdict::Command(_)) => {
+                Ok(Decision::Command(response.into(), latency))
+            }
             Some(step_response::Verdict::Infeasible(why)) => {
                 Ok(Decision::Infeasible(why.reason.clone()))
             }
