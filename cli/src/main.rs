@@ -4,16 +4,15 @@
 //! `sysexits.h`: 64 for a wrong command line or configuration, 65 for a file that makes no sense,
 //! 69 for a node that does not answer, 70 for a fault of ours.
 
-mod aborts;
 mod calls;
 mod failure;
+mod flights;
 mod json;
 mod log;
 mod mission;
 mod plans;
 mod precompute;
 mod safety;
-mod sampling;
 mod serve;
 mod session;
 mod simulate;

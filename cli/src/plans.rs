@@ -20,15 +20,15 @@ use vbar_server::{
     offline::{Refusal, verify_plan},
 };
 use vbar_simulator::{
-    PlanAnswer, PlanChanges, PlanMission, PlanReport, PlanRow, PlanRunOptions, ProgressBar,
-    compute_table, draw_plans, fly_plans, metric_named, plan_rows_json, plan_rows_text, plan_text,
+    PlanAnswer, PlanChanges, PlanMission, PlanRow, compute_table, metric_named, plan_rows_json,
+    plan_rows_text, plan_text,
 };
 
 use crate::{
     failure::Failure,
     json,
     session::{NodeArguments, Session},
-    simulate::{Format, failure, tell},
+    simulate::{Format, failure},
 };
 
 /// Largest plan that is read.
@@ -131,7 +131,7 @@ impl ChangeArguments {
         options.into_iter().find_map(|(name, given)| given.then_some(name))
     }
 
-    fn changes(&self) -> PlanChanges {
+    pub(crate) fn changes(&self) -> PlanChanges {
         PlanChanges {
             duration_s: self.duration,
             instants: self.instants,
@@ -228,56 +228,6 @@ async fn ask(
     };
     let document = client.export_plan(request).await?;
     Ok((response, Some(document.content.to_vec())))
-}
-
-/// What the flights of a mission's plans are asked for.
-pub(crate) struct FlightOptions {
-    pub(crate) run: PlanRunOptions,
-    pub(crate) format: Format,
-    /// Folder for pictures and the report as files.
-    pub(crate) out: Option<PathBuf>,
-}
-
-impl FlightOptions {
-    /// With the changes of the command line.
-    pub(crate) fn changed(mut self, changes: &ChangeArguments) -> Self {
-        self.run.changes = changes.changes();
-        self
-    }
-}
-
-/// Flies a mission's plans and reports.
-pub(crate) async fn fly(
-    mission: &PlanMission,
-    node: &NodeArguments,
-    options: FlightOptions,
-) -> Result<(), Failure> {
-    let session = Session::open(node).await?;
-    let progress = ProgressBar::default();
-    let flown = fly_plans(&session.client, mission, &options.run, &progress).await;
-    session.close().await;
-    let report = flown.map_err(failure)?;
-    match options.format {
-        Format::Table => json::print(report.table().trim_end())?,
-        Format::Json => json::print(&format!("{:#}", report.json()))?,
-    }
-    match &options.out {
-        Some(folder) => tell_files(&report, folder),
-        None => Ok(()),
-    }
-}
-
-fn tell_files(report: &PlanReport, folder: &Path) -> Result<(), Failure> {
-    let cannot = |fault: &dyn std::fmt::Display| {
-        Failure::cannot_write(format!("{}: {fault}", folder.display()))
-    };
-    let mut written = draw_plans(report, folder).map_err(|fault| cannot(&fault))?;
-    written.extend(report.write_runs(folder).map_err(|fault| cannot(&fault))?);
-    let path = folder.join(format!("{}_report.json", report.mission.name));
-    write(&path, format!("{:#}\n", report.json()).as_bytes())?;
-    written.push(path);
-    tell(&written, folder);
-    Ok(())
 }
 
 /// Checks a plan without a node.

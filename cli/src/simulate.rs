@@ -13,12 +13,11 @@ use vbar_simulator::{
 };
 
 use crate::{
-    aborts,
     failure::Failure,
+    flights::{self, Telling},
     json,
     mission::MissionArguments,
-    plans::{self, ChangeArguments, FlightOptions},
-    sampling,
+    plans::ChangeArguments,
     session::Session,
 };
 
@@ -73,6 +72,20 @@ pub(crate) struct SimulateArguments {
 }
 
 impl SimulateArguments {
+    /// How the flights of mission `name` are reported.
+    fn telling(&self, name: &str) -> Telling {
+        let folder = || self.out.clone().unwrap_or_else(|| Path::new("out").join(name));
+        Telling { format: self.format, out: (!self.no_pictures).then(folder) }
+    }
+
+    /// Changes of a plan mean nothing for other missions.
+    fn refuse_changes(&self) -> Result<(), Failure> {
+        match self.changes.given() {
+            Some(name) => Err(Failure::usage(format!("{name} is not for this mission"))),
+            None => Ok(()),
+        }
+    }
+
     /// Options of closed loops with a variable horizon alone, and whether they were given.
     fn horizon_options(&self) -> [(&'static str, bool); 4] {
         [
@@ -130,41 +143,37 @@ pub(crate) async fn simulate(arguments: SimulateArguments) -> Result<(), Failure
 
 /// Flies a mission under abort-safe control.
 async fn fly_aborts(mission: &AbortMission, arguments: SimulateArguments) -> Result<(), Failure> {
-    if let Some(name) = arguments.changes.given() {
-        return Err(Failure::usage(format!("{name} is not for this mission")));
-    }
+    arguments.refuse_changes()?;
     arguments.mission.refuse(arguments.horizon_options())?;
-    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
-    let options = aborts::FlightOptions {
-        run: AbortRunOptions {
-            runs: arguments.runs,
-            seed: arguments.seed,
-            concurrency: arguments.concurrency,
-            variant: arguments.variant,
-        },
-        format: arguments.format,
-        out: (!arguments.no_pictures).then_some(folder),
+    let telling = arguments.telling(&mission.name);
+    let options = AbortRunOptions {
+        runs: arguments.runs,
+        seed: arguments.seed,
+        concurrency: arguments.concurrency,
+        variant: arguments.variant,
     };
-    aborts::fly(mission, &arguments.mission.node, options).await
+    flights::fly(&arguments.mission.node, &telling, async |client, progress| {
+        vbar_simulator::fly_aborts(client, mission, &options, progress).await
+    })
+    .await
 }
 
 /// Flies the plans of a mission with disturbance feedback.
 async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Result<(), Failure> {
     arguments.mission.refuse(arguments.horizon_options())?;
-    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
-    let options = FlightOptions {
-        run: PlanRunOptions {
-            runs: arguments.runs,
-            seed: arguments.seed,
-            concurrency: arguments.concurrency,
-            variant: arguments.variant,
-            with_pictures: !arguments.no_pictures,
-            ..PlanRunOptions::default()
-        },
-        format: arguments.format,
-        out: (!arguments.no_pictures).then_some(folder),
+    let telling = arguments.telling(&mission.name);
+    let options = PlanRunOptions {
+        runs: arguments.runs,
+        seed: arguments.seed,
+        concurrency: arguments.concurrency,
+        variant: arguments.variant,
+        with_pictures: !arguments.no_pictures,
+        changes: arguments.changes.changes(),
     };
-    plans::fly(mission, &arguments.mission.node, options.changed(&arguments.changes)).await
+    flights::fly(&arguments.mission.node, &telling, async |client, progress| {
+        vbar_simulator::fly_plans(client, mission, &options, progress).await
+    })
+    .await
 }
 
 /// Flies a mission under sampled chance constraints.
@@ -172,24 +181,23 @@ async fn fly_sampling(
     mission: &SamplingMission,
     arguments: SimulateArguments,
 ) -> Result<(), Failure> {
-    let scheme = arguments.mission.scheme()?;
+    arguments.refuse_changes()?;
     let foreign = arguments.horizon_options().into_iter().find(|(_, given)| *given);
-    if let Some(name) = foreign.map(|(name, _)| name).or(arguments.changes.given()) {
+    if let Some((name, _)) = foreign {
         return Err(Failure::usage(format!("{name} is not for this mission")));
     }
-    let folder = arguments.out.unwrap_or_else(|| Path::new("out").join(&mission.name));
-    let options = sampling::FlightOptions {
-        run: SamplingRunOptions {
-            scheme,
-            repetitions: arguments.runs,
-            seed: arguments.seed,
-            concurrency: arguments.concurrency,
-            variant: arguments.variant,
-        },
-        format: arguments.format,
-        out: (!arguments.no_pictures).then_some(folder),
+    let telling = arguments.telling(&mission.name);
+    let options = SamplingRunOptions {
+        scheme: arguments.mission.scheme()?,
+        repetitions: arguments.runs,
+        seed: arguments.seed,
+        concurrency: arguments.concurrency,
+        variant: arguments.variant,
     };
-    sampling::fly(mission, &arguments.mission.node, options).await
+    flights::fly(&arguments.mission.node, &telling, async |client, progress| {
+        vbar_simulator::fly_sampling(client, mission, &options, progress).await
+    })
+    .await
 }
 
 fn options(arguments: &SimulateArguments) -> Result<RunOptions, Failure> {
