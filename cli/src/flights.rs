@@ -29,114 +29,98 @@ pub(crate) struct Telling {
 }
 
 /// What flights of a mission came to.
-pub(crate) trait FlightReport {
+pub(crate) struct Told<W> {
     /// Of the mission.
-    fn name(&self) -> &str;
+    pub(crate) name: String,
     /// For people.
-    fn table(&self) -> String;
+    pub(crate) table: String,
     /// For programs.
-    fn json(&self) -> Value;
-    /// Writes pictures and tables; returns what is worth naming.
-    fn write(&self, folder: &Path) -> Result<Vec<PathBuf>, String>;
+    pub(crate) json: Value,
+    /// Writes pictures and tables to a folder; returns what is worth naming.
+    pub(crate) write: W,
 }
 
 /// Flies and reports.
-pub(crate) async fn fly<R: FlightReport>(
+pub(crate) async fn fly<W>(
     node: &NodeArguments,
     telling: &Telling,
-    flights: impl AsyncFnOnce(&Client, &ProgressBar) -> Result<R, SimulationError>,
-) -> Result<(), Failure> {
+    flights: impl AsyncFnOnce(&Client, &ProgressBar) -> Result<Told<W>, SimulationError>,
+) -> Result<(), Failure>
+where
+    W: FnOnce(&Path) -> Result<Vec<PathBuf>, String>,
+{
     let session = Session::open(node).await?;
     let flown = flights(&session.client, &ProgressBar::default()).await;
     session.close().await;
-    let report = flown.map_err(failure)?;
-    match telling.format {
-        Format::Table => json::print(report.table().trim_end())?,
-        Format::Json => json::print(&format!("{:#}", report.json()))?,
-    }
-    match &telling.out {
-        Some(folder) => write_files(&report, folder),
-        None => Ok(()),
-    }
-}
-
-/// Pictures and tables, and the report beside them.
-fn write_files(report: &impl FlightReport, folder: &Path) -> Result<(), Failure> {
+    let Told { name, table, json, write } = flown.map_err(failure)?;
+    let json = format!("{json:#}");
+    json::print(match telling.format {
+        Format::Table => table.trim_end(),
+        Format::Json => &json,
+    })?;
+    let Some(folder) = &telling.out else { return Ok(()) };
     let cannot =
         |fault: &dyn Display| Failure::cannot_write(format!("{}: {fault}", folder.display()));
-    let mut written = report.write(folder).map_err(|fault| cannot(&fault))?;
-    let path = folder.join(format!("{}_report.json", report.name()));
-    fs::write(&path, format!("{:#}\n", report.json())).map_err(|fault| cannot(&fault))?;
+    let mut written = write(folder).map_err(|fault| cannot(&fault))?;
+    let path = folder.join(format!("{name}_report.json"));
+    fs::write(&path, json + "\n").map_err(|fault| cannot(&fault))?;
     written.push(path);
     tell(&written, folder);
     Ok(())
 }
 
+/// The flights of a mission's plans.
+pub(crate) fn of_plans(
+    report: PlanReport,
+) -> Told<impl FnOnce(&Path) -> Result<Vec<PathBuf>, String>> {
+    Told {
+        name: report.mission.name.clone(),
+        table: report.table(),
+        json: report.json(),
+        write: move |folder: &Path| {
+            let mut written = draw_plans(&report, folder).map_err(said)?;
+            written.extend(report.write_runs(folder).map_err(said)?);
+            Ok(written)
+        },
+    }
+}
+
+/// The flights of a mission under abort-safe control; of one run with every step of it.
+pub(crate) fn of_aborts(
+    report: AbortReport,
+) -> Told<impl FnOnce(&Path) -> Result<Vec<PathBuf>, String>> {
+    Told {
+        name: report.mission.name.clone(),
+        table: report.table(),
+        json: report.json(),
+        write: move |folder: &Path| {
+            let mut written = draw_aborts(&report, folder).map_err(said)?;
+            written.extend(report.write_runs(folder).map_err(said)?);
+            if report.runs == 1 {
+                written.extend(report.write_traces(folder).map_err(said)?);
+            }
+            Ok(written)
+        },
+    }
+}
+
+/// The flights of a mission under sampled chance constraints, every step of them unnamed in the
+/// folder `traces`.
+pub(crate) fn of_sampling(
+    report: SamplingReport,
+) -> Told<impl FnOnce(&Path) -> Result<Vec<PathBuf>, String>> {
+    Told {
+        name: report.mission.name.clone(),
+        table: report.table(),
+        json: report.json(),
+        write: move |folder: &Path| {
+            let written = draw_sampling(&report, folder).map_err(said)?;
+            report.write_traces(&folder.join("traces")).map_err(said)?;
+            Ok(written)
+        },
+    }
+}
+
 fn said(fault: impl Display) -> String {
     fault.to_string()
-}
-
-impl FlightReport for PlanReport {
-    fn name(&self) -> &str {
-        &self.mission.name
-    }
-
-    fn table(&self) -> String {
-        self.table()
-    }
-
-    fn json(&self) -> Value {
-        self.json()
-    }
-
-    fn write(&self, folder: &Path) -> Result<Vec<PathBuf>, String> {
-        let mut written = draw_plans(self, folder).map_err(said)?;
-        written.extend(self.write_runs(folder).map_err(said)?);
-        Ok(written)
-    }
-}
-
-impl FlightReport for AbortReport {
-    fn name(&self) -> &str {
-        &self.mission.name
-    }
-
-    fn table(&self) -> String {
-        self.table()
-    }
-
-    fn json(&self) -> Value {
-        self.json()
-    }
-
-    /// Every step too, of a mission of one run.
-    fn write(&self, folder: &Path) -> Result<Vec<PathBuf>, String> {
-        let mut written = draw_aborts(self, folder).map_err(said)?;
-        written.extend(self.write_runs(folder).map_err(said)?);
-        if self.runs == 1 {
-            written.extend(self.write_traces(folder).map_err(said)?);
-        }
-        Ok(written)
-    }
-}
-
-impl FlightReport for SamplingReport {
-    fn name(&self) -> &str {
-        &self.mission.name
-    }
-
-    fn table(&self) -> String {
-        self.table()
-    }
-
-    fn json(&self) -> Value {
-        self.json()
-    }
-
-    /// Every step of every flight too, in the folder `traces`, unnamed.
-    fn write(&self, folder: &Path) -> Result<Vec<PathBuf>, String> {
-        let written = draw_sampling(self, folder).map_err(said)?;
-        self.write_traces(&folder.join("traces")).map_err(said)?;
-        Ok(written)
-    }
 }

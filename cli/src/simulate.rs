@@ -153,7 +153,8 @@ async fn fly_aborts(mission: &AbortMission, arguments: SimulateArguments) -> Res
         variant: arguments.variant,
     };
     flights::fly(&arguments.mission.node, &telling, async |client, progress| {
-        vbar_simulator::fly_aborts(client, mission, &options, progress).await
+        let flown = vbar_simulator::fly_aborts(client, mission, &options, progress).await;
+        flown.map(flights::of_aborts)
     })
     .await
 }
@@ -171,7 +172,8 @@ async fn fly_plans(mission: &PlanMission, arguments: SimulateArguments) -> Resul
         changes: arguments.changes.changes(),
     };
     flights::fly(&arguments.mission.node, &telling, async |client, progress| {
-        vbar_simulator::fly_plans(client, mission, &options, progress).await
+        let flown = vbar_simulator::fly_plans(client, mission, &options, progress).await;
+        flown.map(flights::of_plans)
     })
     .await
 }
@@ -195,7 +197,8 @@ async fn fly_sampling(
         variant: arguments.variant,
     };
     flights::fly(&arguments.mission.node, &telling, async |client, progress| {
-        vbar_simulator::fly_sampling(client, mission, &options, progress).await
+        let flown = vbar_simulator::fly_sampling(client, mission, &options, progress).await;
+        flown.map(flights::of_sampling)
     })
     .await
 }

@@ -190,14 +190,7 @@ impl Leases {
     /// Writes down what was put off, and removes what expired before `now`: its ids. Blocks on the
     /// store. Called by one thread at a time.
     pub(super) fn sweep(&self, now: SystemTime) -> Vec<ArtifactId> {
-        let (mut dirty, mut expired) = (Vec::new(), Vec::new());
-        for (id, lease) in &self.known().by_id {
-            if lease.expires < now {
-                expired.push((*id, *lease));
-            } else if lease.is_dirty {
-                dirty.push(*id);
-            }
-        }
+        let (dirty, expired) = self.known().part(now);
         for id in dirty {
             if let Err(fault) = self.write_down(id) {
                 tracing::warn!(%id, %fault, "a lease could not be written down");
@@ -211,11 +204,11 @@ impl Leases {
                 .remove(Shelf::Artifacts, &id.0)
                 .and_then(|()| self.store.erase(Ledger::Leases, &id.0, lease.revision));
             match gone {
-                Ok(()) => {
-                    self.known().remove(id);
-                    removed.push(id);
+                Ok(()) => removed.push(id),
+                Err(fault) => {
+                    tracing::warn!(%id, %fault, "an expired artifact stays");
+                    self.known().insert(id, lease);
                 }
-                Err(fault) => tracing::warn!(%id, %fault, "an expired artifact stays"),
             }
         }
         removed
@@ -223,6 +216,21 @@ impl Leases {
 }
 
 impl Known {
+    /// Leases to write down, and those that expired before `now`: these are taken out at once, so
+    /// that no step puts off the end of what is about to go.
+    fn part(&mut self, now: SystemTime) -> (Vec<ArtifactId>, Vec<(ArtifactId, Lease)>) {
+        let (mut dirty, mut expired) = (Vec::new(), Vec::new());
+        for (id, lease) in &self.by_id {
+            if lease.expires < now {
+                expired.push((*id, *lease));
+            } else if lease.is_dirty {
+                dirty.push(*id);
+            }
+        }
+        expired.iter().for_each(|(id, _)| self.remove(*id));
+        (dirty, expired)
+    }
+
     fn insert(&mut self, id: ArtifactId, lease: Lease) {
         self.remove(id);
         self.bytes += lease.size;

@@ -16,8 +16,7 @@ use crate::{
     dynamics::RelativeVector,
     mission::ThrustMode,
     program::{
-        CondensedRegulator, RegulatorAnswer, RegulatorProgram, RelaxedRows, Softness, StateCut,
-        Status,
+        CondensedRegulator, RegulatorAnswer, RegulatorProgram, RelaxedRows, Softness, Status,
     },
     reach::Flight,
     sets::ZonotopeFacets,
@@ -150,11 +149,16 @@ impl Here<'_> {
     fn regulate(&self, state: &State, working: ThrustMode) -> Result<Step, StepError> {
         let cuts = self.cuts(&self.points(state))?;
         let regulator = Regulator::new(self, working, &cuts.cuts);
+        let program = regulator.program(self, &cuts.cuts, None);
+        let condensed = condensed(&program)?;
         let start = regulator.received(&state.active);
-        let answer = self.solve(&regulator, &cuts.cuts, None, &start)?;
+        let answer = program.solve(&condensed, &start, self.budget)?;
         match answer.status {
             Status::Optimal => self.command(&regulator, &cuts, &answer, None),
-            Status::PrimalInfeasible => self.without_trajectory(&regulator, &cuts, &answer),
+            Status::PrimalInfeasible => {
+                let why = self.infeasibility(&regulator, &program, &condensed, &answer)?;
+                self.without_trajectory(&regulator, &cuts, why)
+            }
             other => Err(Failure::Numerical(format!("the regulator ended {other:?}")).into()),
         }
     }
@@ -163,9 +167,8 @@ impl Here<'_> {
         &self,
         regulator: &Regulator,
         cuts: &Cuts,
-        answer: &RegulatorAnswer,
+        infeasibility: Infeasibility,
     ) -> Result<Step, StepError> {
-        let infeasibility = self.infeasibility(regulator, cuts, answer)?;
         match self.problem.fallback {
             Fallback::Abort => {
                 let nominal = self.problem.thrusters.nominal();
@@ -174,25 +177,14 @@ impl Here<'_> {
             Fallback::Soften => {
                 let price = self.price(regulator);
                 let softness = Some(Softness { linear: price, quadratic: price });
-                let soft = self.solve(regulator, &cuts.cuts, softness, &[])?;
+                let program = regulator.program(self, &cuts.cuts, softness);
+                let soft = program.solve(&condensed(&program)?, &[], self.budget)?;
                 if soft.status == Status::Optimal {
                     return self.command(regulator, cuts, &soft, Some(infeasibility));
                 }
                 Ok(self.without_command(Verdict::Infeasible(infeasibility)))
             }
         }
-    }
-
-    fn solve(
-        &self,
-        regulator: &Regulator,
-        cuts: &[StateCut],
-        softness: Option<Softness>,
-        start: &[usize],
-    ) -> Result<RegulatorAnswer, StepError> {
-        let program = regulator.program(self, cuts, softness);
-        let condensed = condensed(&program)?;
-        Ok(program.solve(&condensed, start, self.budget)?)
     }
 
     /// What the idle craft would cost: the scale of the price of violations.
@@ -306,7 +298,8 @@ impl Here<'_> {
     fn infeasibility(
         &self,
         regulator: &Regulator,
-        cuts: &Cuts,
+        program: &RegulatorProgram<'_>,
+        condensed: &CondensedRegulator,
         answer: &RegulatorAnswer,
     ) -> Result<Infeasibility, StepError> {
         let horizon = self.problem.prediction_horizon;
@@ -321,15 +314,13 @@ impl Here<'_> {
             })
             .collect();
         rows.sort_by(|a, b| b.weight.total_cmp(&a.weight));
-        let program = regulator.program(self, &cuts.cuts, None);
-        let condensed = condensed(&program)?;
         let mut relaxations = Vec::new();
         let families = [
             (ConstraintFamily::State, RelaxedRows::Cuts),
             (ConstraintFamily::Input, RelaxedRows::Facets),
         ];
         for (family, relaxed) in families {
-            let least = program.least_relaxation(&condensed, relaxed, self.budget)?;
+            let least = program.least_relaxation(condensed, relaxed, self.budget)?;
             relaxations.extend(least.map(|amount| Relaxation { family, horizon, amount }));
         }
         Ok(Infeasibility {
