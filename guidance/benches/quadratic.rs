@@ -97,6 +97,6 @@ fn warm_by_dual_active_set(bencher: divan::Bencher<'_, '_>, place: &str) {
 #[divan::bench(args = ["interior", "edge"], max_time = 10, sample_count = 10)]
 fn by_clarabel(bencher: divan::Bencher<'_, '_>, place: &str) {
     let program = program(place);
-    solved(&Clarabel.solve_quadratic(&program.borrowed()), place);
-    bencher.bench_local(|| Clarabel.solve_quadratic(&program.borrowed()));
+    solved(&Clarabel.solve_quadratic(&program.borrowed(), Budget::UNLIMITED).unwrap(), place);
+    bencher.bench_local(|| Clarabel.solve_quadratic(&program.borrowed(), Budget::UNLIMITED));
 }

@@ -80,7 +80,7 @@ fn prepare(problem: &Problem, threads: usize) -> Artifact {
             let start = Instant::now();
             let result = OfflineSampling::run_shard(problem, shard, Budget::UNLIMITED);
             let result = result.unwrap_or_else(|error| panic!("shard {shard}: {error:?}"));
-            if let Shard::Rows(rows) = &result {
+            if let Some(rows) = result.survivors() {
                 println!(
                     "shard {shard}: {} rows left, excess {:.2e}, {:.2} s",
                     rows.rows.rows.len(),

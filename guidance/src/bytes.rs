@@ -19,6 +19,7 @@ pub struct DecodeError {
 #[derive(Debug, Default)]
 pub(crate) struct Writer {
     bytes: Vec<u8>,
+    keeps_sign_of_zero: bool,
 }
 
 /// Takes values back, never beyond the end and never more than was announced.
@@ -32,7 +33,19 @@ pub(crate) struct Reader<'a> {
 const COUNT_MAX: usize = 50_000_000;
 
 impl Writer {
+    /// Every number comes back bit by bit, for what is computed on and not compared.
+    pub(crate) fn exact() -> Self {
+        Self { bytes: Vec::new(), keeps_sign_of_zero: true }
+    }
+
     pub(crate) fn finish(self) -> Vec<u8> {
+        self.bytes
+    }
+
+    /// The bytes and a checksum, CRC-32 of all before it; [`Reader::unsealed`] looks at it first.
+    pub(crate) fn seal(mut self) -> Vec<u8> {
+        let checksum = crc32(&self.bytes);
+        self.bytes.extend(checksum.to_le_bytes());
         self.bytes
     }
 
@@ -58,7 +71,7 @@ impl Writer {
 
     pub(crate) fn number(&mut self, value: f64) {
         // One zero: -0.0 and 0.0 mean the same problem.
-        let value = if value == 0.0 { 0.0 } else { value };
+        let value = if value == 0.0 && !self.keeps_sign_of_zero { 0.0 } else { value };
         self.bytes.extend(value.to_le_bytes());
     }
 
@@ -96,6 +109,27 @@ impl Writer {
 impl<'a> Reader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
         Self { bytes, offset: 0 }
+    }
+
+    /// Reads what [`Writer::seal`] wrote, if nothing changed it on the way; `go_on` is asked now and
+    /// then.
+    pub(crate) fn unsealed<E: From<DecodeError>>(
+        bytes: &'a [u8],
+        go_on: impl Fn() -> Result<(), E>,
+    ) -> Result<Self, E> {
+        const BLOCK: usize = 1 << 16;
+        let end = bytes.len().saturating_sub(size_of::<u32>());
+        let (body, checksum) = bytes.split_at(end);
+        let mut register = u32::MAX;
+        for block in body.chunks(BLOCK) {
+            go_on()?;
+            register = crc32_moved_on(register, block);
+        }
+        if checksum != (!register).to_le_bytes() {
+            let what = "the checksum differs: the bytes were changed on the way".into();
+            return Err(DecodeError { offset: end, what }.into());
+        }
+        Ok(Self::new(body))
     }
 
     pub(crate) fn fault(&self, what: impl Into<String>) -> DecodeError {
@@ -204,17 +238,33 @@ impl<'a> Reader<'a> {
 
 /// CRC-32 as in IEEE 802.3 and ZIP: reflected polynomial 0xEDB88320, all ones before and after.
 /// Finds every change of one bit, and every burst of up to 32.
-pub(crate) fn crc32(bytes: &[u8]) -> u32 {
-    let mut register = u32::MAX;
-    for &byte in bytes {
-        register ^= u32::from(byte);
-        for _ in 0..8 {
-            let carry = register & 1;
-            register = (register >> 1) ^ (0xEDB8_8320 * carry);
-        }
-    }
-    !register
+fn crc32(bytes: &[u8]) -> u32 {
+    !crc32_moved_on(u32::MAX, bytes)
 }
+
+/// The register after these bytes too.
+fn crc32_moved_on(register: u32, bytes: &[u8]) -> u32 {
+    bytes.iter().fold(register, |register, &byte| {
+        (register >> 8) ^ CRC32_OF_BYTE[(register as u8 ^ byte) as usize]
+    })
+}
+
+/// What eight steps of the register make of each lowest byte.
+const CRC32_OF_BYTE: [u32; 256] = {
+    let mut table = [0; 256];
+    let mut byte = 0;
+    while byte < 256 {
+        let mut register = byte as u32;
+        let mut bit = 0;
+        while bit < 8 {
+            register = (register >> 1) ^ (0xEDB8_8320 * (register & 1));
+            bit += 1;
+        }
+        table[byte] = register;
+        byte += 1;
+    }
+    table
+};
 
 #[cfg(test)]
 mod tests {

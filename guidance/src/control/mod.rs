@@ -4,6 +4,7 @@ pub mod abort_safe;
 mod canonical;
 pub mod disturbance_feedback;
 pub mod offline_sampling;
+mod shard;
 pub mod variable_horizon;
 mod verdict;
 
@@ -11,7 +12,11 @@ pub use verdict::{
     Certificate, Claim, ConstraintFamily, ConstraintMargin, Infeasibility, ProofRow, Relaxation,
 };
 
-use crate::budget::{Budget, Interruption};
+use crate::{
+    budget::{Budget, Interruption},
+    bytes::Reader,
+    reach::ReadError,
+};
 
 /// The one list of methods.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -76,6 +81,10 @@ pub trait Controller {
     /// The decision and its proof.
     type Answer;
 
+    /// About the most bytes that a precompute and what it makes take, from dimensions alone, so
+    /// that nothing has to be spent to know it.
+    fn memory_bytes(problem: &Self::Problem) -> usize;
+
     /// Number of independent shards of a precompute, at least 1.
     fn shards(problem: &Self::Problem) -> usize;
 
@@ -89,10 +98,25 @@ pub trait Controller {
         budget: Budget<'_>,
     ) -> Result<Self::Shard, PrepareError>;
 
+    /// Bytes of a shard, for whoever merges it elsewhere.
+    fn shard_to_bytes(problem: &Self::Problem, shard: &Self::Shard) -> Vec<u8>;
+
+    /// Reads what [`Controller::shard_to_bytes`] wrote, bit by bit.
+    ///
+    /// # Errors
+    /// [`DecodeError`](crate::bytes::DecodeError) for anything else: bytes that were changed, a
+    /// shard of another problem, of another method or of another version of it; the interruption of
+    /// the budget.
+    fn shard_from_bytes(
+        problem: &Self::Problem,
+        bytes: &[u8],
+        budget: Budget<'_>,
+    ) -> Result<Self::Shard, ReadError>;
+
     /// Puts shards, in their order, together; this can be long work too.
     ///
     /// # Errors
-    /// As [`Controller::run_shard`].
+    /// As [`Controller::run_shard`]; [`Failure::Numerical`] if they are not all, each once.
     fn merge(
         problem: &Self::Problem,
         shards: Vec<Self::Shard>,
@@ -182,6 +206,20 @@ pub enum StepError {
     },
     /// We are at fault.
     Failure(Failure),
+}
+
+/// What was read is prepared again: that fails for what the bytes say, or because time is over.
+fn unread(error: PrepareError, reader: &Reader<'_>) -> ReadError {
+    match error {
+        PrepareError::Failure(Failure::Interrupted(why)) => why.into(),
+        PrepareError::Failure(Failure::Numerical(what)) => reader.fault(what).into(),
+        PrepareError::Infeasible(why) => reader.fault(why.reason).into(),
+        PrepareError::Faults(faults) => {
+            let said = |f: &Fault| format!("{}: {}, got {}", f.field, f.expected, f.got);
+            let first = faults.first().map(said);
+            reader.fault(first.unwrap_or_default()).into()
+        }
+    }
 }
 
 impl From<Failure> for StepError {

@@ -3,6 +3,7 @@
 use nalgebra::{SMatrix, SVector, Vector3};
 
 use crate::{
+    budget::{Budget, Interruption},
     matrices::product_fixed,
     orbit::{EARTH_MU_M3_S2, KeplerOrbit},
     units::{Mass, Seconds},
@@ -66,6 +67,16 @@ fn rates(orbit: &KeplerOrbit, nu: f64) -> SMatrix<f64, 3, 6> {
     matrix
 }
 
+/// Steps that the integration over `duration` would take, a whole number: the work of
+/// [`elliptic_step`], which takes no more than a million.
+#[must_use]
+pub fn integration_steps(orbit: &KeplerOrbit, duration: Seconds) -> f64 {
+    let perigee = orbit.semi_major_axis().metres() * (1.0 - orbit.eccentricity());
+    let fastest = libm::sqrt(EARTH_MU_M3_S2 * orbit.semi_latus_rectum_m()) / (perigee * perigee);
+    let turned = fastest * duration.seconds();
+    libm::ceil(turned / TURN_MAX_RAD)
+}
+
 /// A and B from `start` over `duration`, integrated along the orbit.
 ///
 /// Freezing A at the start instead costs 2e-3 to 8e-3 in A at e = 0.1 and 30 s.
@@ -77,9 +88,7 @@ pub fn elliptic_step(
     duration: Seconds,
 ) -> HeldStep {
     let (from, length) = (start.seconds(), duration.seconds());
-    let perigee = orbit.semi_major_axis().metres() * (1.0 - orbit.eccentricity());
-    let fastest = libm::sqrt(EARTH_MU_M3_S2 * orbit.semi_latus_rectum_m()) / (perigee * perigee);
-    let count = libm::ceil(fastest * length / TURN_MAX_RAD).clamp(1.0, INTEGRATION_STEPS_MAX);
+    let count = integration_steps(orbit, duration).clamp(1.0, INTEGRATION_STEPS_MAX);
     let step = length / count;
     let at = |t: f64| rates(orbit, orbit.true_anomaly_after(Seconds::from_seconds(t)).radians());
     // Columns 0-5: A; 6-8: B for unit acceleration.
@@ -126,24 +135,45 @@ impl PeriodicPlant {
         steps_per_period: usize,
         fractions: usize,
     ) -> Self {
+        let unlimited = Budget::UNLIMITED;
+        Self::within(orbit, mass, sample_time, [steps_per_period, fractions], unlimited)
+            .expect("this budget never interrupts")
+    }
+
+    /// The same for kp and the parts of a step in `counts`, if there is time.
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    ///
+    /// # Panics
+    /// As [`PeriodicPlant::new`].
+    pub fn within(
+        orbit: &KeplerOrbit,
+        mass: Mass,
+        sample_time: Seconds,
+        counts: [usize; 2],
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
+        let [steps_per_period, fractions] = counts;
         assert!(steps_per_period > 0 && fractions > 0, "at least one step and one part");
         let time = sample_time.seconds();
         let over = |k: usize, part: f64| {
+            budget.check()?;
             let start = Seconds::from_seconds(k as f64 * time);
-            elliptic_step(orbit, mass, start, Seconds::from_seconds(part * time))
+            Ok(elliptic_step(orbit, mass, start, Seconds::from_seconds(part * time)))
         };
         let part = |i: usize| i as f64 / fractions as f64;
         let whole = steps_per_period as f64 * time - orbit.period().seconds();
         let invariant = orbit.eccentricity() == 0.0 && steps_per_period == 1;
-        Self {
+        Ok(Self {
             sample_time,
             fold_error: Seconds::from_seconds(if invariant { 0.0 } else { whole }),
-            steps: (0..steps_per_period).map(|k| over(k, 1.0)).collect(),
+            steps: (0..steps_per_period).map(|k| over(k, 1.0)).collect::<Result<_, _>>()?,
             fractions: (0..steps_per_period)
                 .map(|k| (1..fractions).map(|i| over(k, part(i))).collect())
-                .collect(),
+                .collect::<Result<_, _>>()?,
             fraction_count: fractions,
-        }
+        })
     }
 
     /// Length of a step.

@@ -3,7 +3,11 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::{Prediction, spectral_radius};
-use crate::matrices::product;
+use crate::{
+    budget::{Budget, Interruption},
+    bytes::{DecodeError, Reader, Writer},
+    matrices::product,
+};
 
 /// Weights of J = sum_l x_l'Q x_l + u_l'R u_l + x_T'P x_T.
 #[derive(Debug, Clone, PartialEq)]
@@ -55,6 +59,23 @@ impl ExpectedCost {
         self.samples
     }
 
+    /// Appends the sum.
+    pub(crate) fn write(&self, writer: &mut Writer) {
+        writer.matrix(&self.sum);
+        writer.count(self.samples);
+    }
+
+    /// Reads what [`Self::write`] wrote, for z of so many components and so many samples.
+    pub(crate) fn read(
+        reader: &mut Reader<'_>,
+        width: usize,
+        samples: usize,
+    ) -> Result<Self, DecodeError> {
+        let cost = Self { sum: reader.matrix()?, samples: reader.count()? };
+        let fits = cost.sum.shape() == (width, width) && cost.samples == samples;
+        if fits { Ok(cost) } else { Err(reader.fault("an expected cost of another problem")) }
+    }
+
     /// The mean S, symmetric.
     #[must_use]
     pub fn mean(&self) -> DMatrix<f64> {
@@ -84,6 +105,15 @@ pub enum TerminalCostError {
     /// The equation has no solution to working precision.
     #[error("the equation for the terminal weight is singular")]
     Singular,
+    /// Stopped from outside.
+    #[error("stopped: {0:?}")]
+    Interrupted(Interruption),
+}
+
+impl From<Interruption> for TerminalCostError {
+    fn from(interruption: Interruption) -> Self {
+        Self::Interrupted(interruption)
+    }
 }
 
 /// P with P = Q + K'R K + mean of A_K'P A_K over the samples of A_K = A + B K: equality in
@@ -96,15 +126,19 @@ pub fn terminal_cost(
     input_weight: &DMatrix<f64>,
     gain: &DMatrix<f64>,
     closed_loops: &[DMatrix<f64>],
+    budget: Budget<'_>,
 ) -> Result<DMatrix<f64>, TerminalCostError> {
     let n = state_weight.nrows();
     // vec(A'PA) = (A (x) A)' vec(P); its mean decides about mean-square stability.
     let mut mean = DMatrix::zeros(n * n, n * n);
     for closed in closed_loops {
+        budget.check()?;
         mean += closed.kronecker(closed).transpose();
     }
     mean /= closed_loops.len().max(1) as f64;
+    budget.check()?;
     let growth = spectral_radius(&mean);
+    budget.check()?;
     if !(growth < 1.0) {
         return Err(TerminalCostError::Unstable(growth));
     }

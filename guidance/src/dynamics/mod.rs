@@ -16,6 +16,7 @@ mod zero_order_hold;
 pub use clohessy_wiltshire::clohessy_wiltshire;
 pub use elliptic::{
     ForceMatrix, HeldStep, PeriodicPlant, RelativeVector, TransitionMatrix, elliptic_step,
+    integration_steps,
 };
 pub use expected_cost::{ExpectedCost, StageWeights, TerminalCostError, terminal_cost};
 pub use gain::{GainError, linear_quadratic_regulator, place_poles, spectral_radius};

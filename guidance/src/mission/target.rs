@@ -2,6 +2,8 @@
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
+use crate::budget::{Budget, Interruption};
+
 /// Motion of the points that matter, relative to the target's centre of mass, in RTN.
 #[derive(Debug, Clone, PartialEq)]
 pub enum TargetMotion {
@@ -60,28 +62,38 @@ pub struct TargetSample {
 
 /// Largest turn of one integration step, radians: leaves errors near 1e-13 a radian.
 const TURN_MAX_RAD: f64 = 2e-3;
+/// Integration steps between two looks at the budget.
+const BUDGET_PERIOD: usize = 256;
+
+/// Most integration steps of a motion, all samples together: a second or two. A body that turns as
+/// fast as EnviSat takes half of them in ten thousand samples.
+const INTEGRATION_STEPS_MAX: usize = 10_000_000;
 
 impl TargetMotion {
-    /// Samples 0 .. count - 1, one every `sample_time_s`; fewer if that is all there are.
+    /// Samples 0 .. count - 1, one every `sample_time_s`; fewer if that is all there are, or if the
+    /// body turns too often to follow it so long.
     ///
     /// `mean_motion_rad_s` is RTN's own angular velocity about its z axis.
-    #[must_use]
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
     pub fn samples(
         &self,
         mean_motion_rad_s: f64,
         sample_time_s: f64,
         count: usize,
-    ) -> Vec<TargetSample> {
+        budget: Budget<'_>,
+    ) -> Result<Vec<TargetSample>, Interruption> {
         match self {
-            Self::Sampled(samples) => samples.iter().take(count).copied().collect(),
+            Self::Sampled(samples) => Ok(samples.iter().take(count).copied().collect()),
             Self::Rigid { capture_point_m, docking_port_m, body } => {
-                let poses = body.poses(mean_motion_rad_s, sample_time_s, count);
+                let poses = body.poses(mean_motion_rad_s, sample_time_s, count, budget)?;
                 let sample = |pose: &Pose| TargetSample {
                     capture_point_m: pose.attitude * capture_point_m,
                     capture_velocity_m_s: pose.rate_rad_s.cross(&(pose.attitude * capture_point_m)),
                     docking_port_m: pose.attitude * docking_port_m,
                 };
-                poses.iter().map(sample).collect()
+                Ok(poses.iter().map(sample).collect())
             }
         }
     }
@@ -94,8 +106,15 @@ struct Pose {
 }
 
 impl BodyMotion {
-    fn poses(&self, mean_motion_rad_s: f64, sample_time_s: f64, count: usize) -> Vec<Pose> {
-        match self {
+    fn poses(
+        &self,
+        mean_motion_rad_s: f64,
+        sample_time_s: f64,
+        count: usize,
+        budget: Budget<'_>,
+    ) -> Result<Vec<Pose>, Interruption> {
+        budget.check()?;
+        Ok(match self {
             Self::Fixed => (0..count)
                 .map(|_| Pose { attitude: Matrix3::identity(), rate_rad_s: Vector3::zeros() })
                 .collect(),
@@ -116,10 +135,14 @@ impl BodyMotion {
                     inertia: *inertia,
                 };
                 let start = rtn_from_body.to_rotation_matrix().into_inner();
-                let mut poses = Vec::with_capacity(count);
+                let mut poses = Vec::new();
+                let mut left = INTEGRATION_STEPS_MAX;
                 for k in 0..count {
                     if k > 0 {
-                        spinning.advance(sample_time_s);
+                        let steps = spinning.steps(sample_time_s);
+                        let Some(rest) = left.checked_sub(steps) else { break };
+                        spinning.advance(sample_time_s, steps, budget)?;
+                        left = rest;
                     }
                     // The axes "at rest" agree with RTN at the start and turn back by the orbit.
                     let back = rotation(&orbit, -sample_time_s * as_f64(k));
@@ -131,7 +154,7 @@ impl BodyMotion {
                 }
                 poses
             }
-        }
+        })
     }
 }
 
@@ -165,14 +188,23 @@ impl RigidBody {
         UnitQuaternion::from_quaternion(self.attitude).to_rotation_matrix().into_inner()
     }
 
-    /// Classical Runge-Kutta steps of at most [`TURN_MAX_RAD`].
-    fn advance(&mut self, time: f64) {
+    /// Steps of at most [`TURN_MAX_RAD`] in `time`.
+    fn steps(&self, time: f64) -> usize {
         let (smallest, largest) = (self.inertia.min(), self.inertia.max());
         let turn = self.rate.norm() * time * (largest / smallest);
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-        let steps = libm::ceil(turn / TURN_MAX_RAD).clamp(1.0, 1e6) as usize;
+        let steps = libm::ceil(turn / TURN_MAX_RAD).max(1.0);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at least 1")]
+        let whole = steps as usize;
+        if turn.is_nan() { usize::MAX } else { whole }
+    }
+
+    /// Classical Runge-Kutta steps.
+    fn advance(&mut self, time: f64, steps: usize, budget: Budget<'_>) -> Result<(), Interruption> {
         let h = time / as_f64(steps);
-        for _ in 0..steps {
+        for step in 0..steps {
+            if step % BUDGET_PERIOD == 0 {
+                budget.check()?;
+            }
             let (q, w) = (self.attitude, self.rate);
             let (q1, w1) = self.derivative(q, w);
             let (q2, w2) = self.derivative(q + q1 * (0.5 * h), w + w1 * (0.5 * h));
@@ -182,6 +214,7 @@ impl RigidBody {
             self.attitude = attitude / attitude.norm();
             self.rate = w + (w1 + (w2 + w3) * 2.0 + w4) * (h / 6.0);
         }
+        Ok(())
     }
 
     fn derivative(
@@ -216,7 +249,8 @@ mod tests {
     fn velocity_is_the_derivative_of_position() {
         for relative_to in [RateReference::Inertial, RateReference::Rtn] {
             // Central differences over 0.1 s leave about 1e-6 of the third derivative, 2e-6 m/s^3.
-            let samples = torque_free(relative_to).samples(0.001, 0.05, 60);
+            let samples =
+                torque_free(relative_to).samples(0.001, 0.05, 60, Budget::UNLIMITED).unwrap();
             for k in [1, 30, 58] {
                 let change = samples[k + 1].capture_point_m - samples[k - 1].capture_point_m;
                 let error = change / 0.1 - samples[k].capture_velocity_m_s;
@@ -235,9 +269,30 @@ mod tests {
         let momentum = |b: &RigidBody| b.rotation() * b.inertia.component_mul(&b.rate);
         let energy = |b: &RigidBody| b.inertia.component_mul(&b.rate).dot(&b.rate);
         let (before, energy_before) = (momentum(&body), energy(&body));
-        body.advance(3000.0);
+        body.advance(3000.0, body.steps(3000.0), Budget::UNLIMITED).unwrap();
         assert!((momentum(&body) - before).norm() < 1e-11 * before.norm());
         assert!((energy(&body) - energy_before).abs() < 1e-11 * energy_before);
+    }
+
+    #[test]
+    fn motion_that_turns_too_often_has_fewer_samples() {
+        let samples = |rate_rad_s: f64, moment: f64| {
+            let body = BodyMotion::TorqueFree {
+                inertia: Vector3::new(moment, 1.8, 2.4),
+                rtn_from_body: UnitQuaternion::identity(),
+                rate_body_rad_s: Vector3::new(rate_rad_s, 1e-3, 0.0),
+                relative_to: RateReference::Rtn,
+            };
+            let point = Vector3::x();
+            let motion =
+                TargetMotion::Rigid { capture_point_m: point, docking_port_m: point, body };
+            motion.samples(0.001, 10.0, 10_000, Budget::UNLIMITED).unwrap().len()
+        };
+        // The second has no moment about an axis, which is no body: its turns are not a number.
+        for (rate_rad_s, moment) in [(1e4, 1.0), (f64::MAX, 1.0), (1e-3, 0.0)] {
+            assert!(samples(rate_rad_s, moment) < 10, "{rate_rad_s} rad/s about {moment} kg m2");
+        }
+        assert_eq!(samples(0.01, 1.0), 10_000);
     }
 
     #[test]
@@ -255,7 +310,9 @@ mod tests {
             relative_to: RateReference::Rtn,
         });
         let spinning = rigid(BodyMotion::Spin(rate));
-        let (a, b) = (tumbling.samples(0.001, 10.0, 50), spinning.samples(0.001, 10.0, 50));
+        let samples =
+            |motion: &TargetMotion| motion.samples(0.001, 10.0, 50, Budget::UNLIMITED).unwrap();
+        let (a, b) = (samples(&tumbling), samples(&spinning));
         for (a, b) in a.iter().zip(&b) {
             assert!((a.capture_point_m - b.capture_point_m).norm() < 1e-11);
         }

@@ -17,6 +17,7 @@
 use nalgebra::DMatrix;
 
 use super::tables::add_scaled;
+use crate::budget::{Budget, Interruption};
 
 /// Largest product of the largest entries of A^l and A^-l, in units of the reach: four of the
 /// sixteen digits, which leaves a hundredth of the solver's feasibility tolerance.
@@ -37,7 +38,13 @@ pub(crate) struct Anchors {
 
 impl Anchors {
     /// For A (n x n), B (n x m) and stages up to `last`; `units` are sizes of the n components.
-    pub(super) fn new(a: &DMatrix<f64>, b: &DMatrix<f64>, units: &[f64], last: usize) -> Self {
+    pub(super) fn new(
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        units: &[f64],
+        last: usize,
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
         let (n, m) = (a.nrows(), b.ncols());
         let mut anchors = Self { n, m, block: 1, powers: Vec::new(), inputs: Vec::new() };
         let mut power = DMatrix::identity(n, n);
@@ -46,6 +53,7 @@ impl Anchors {
         if let Some(inverse) = a.clone().try_inverse() {
             let mut back = inverse.clone();
             while anchors.block <= last && growth(&power, &back, units) <= GROWTH_MAX {
+                budget.check()?;
                 anchors.powers.extend(power.transpose().iter());
                 anchors.inputs.extend(crate::matrices::product(&back, b).iter());
                 anchors.block += 1;
@@ -55,7 +63,7 @@ impl Anchors {
         }
         anchors.powers.extend(power.transpose().iter());
         anchors.inputs.extend(b.iter());
-        anchors
+        Ok(anchors)
     }
 
     /// Blocks that have a stage up to `horizon`.

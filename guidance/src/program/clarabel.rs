@@ -3,6 +3,8 @@
 //! Deliberately a different formulation from [`super::DualSimplex`]: states stay variables and
 //! absolute values become epigraphs, so that a fault in one does not hide in the other.
 
+use std::sync::{Arc, OnceLock};
+
 use ::clarabel::{
     algebra::CscMatrix,
     solver::{
@@ -14,9 +16,22 @@ use ::clarabel::{
 use super::{Basis, HorizonProgram, Multiplier, RowFamily, RowId, Solution, Solver, Status};
 use crate::budget::{Budget, Interruption};
 
-/// The general back-end. Looks at the budget before and after a solve, not within.
+/// The general back-end. Looks at the budget before a solve and in every iteration.
 #[derive(Debug, Default, Clone, Copy)]
 pub struct Clarabel;
+
+/// Runs a solver of Clarabel's, which asks the budget in every iteration.
+pub(super) fn run(solver: &mut DefaultSolver<f64>, budget: Budget<'_>) -> Result<(), Interruption> {
+    let heard = Arc::new(OnceLock::new());
+    if let Some(question) = budget.question() {
+        let (question, heard) = (Arc::clone(question), Arc::clone(&heard));
+        solver.set_termination_callback(move |_| {
+            question().is_some_and(|why| heard.set(why).is_ok())
+        });
+    }
+    solver.solve();
+    heard.get().map_or(Ok(()), |why| Err(*why))
+}
 
 impl Solver for Clarabel {
     fn solve(
@@ -28,8 +43,7 @@ impl Solver for Clarabel {
     ) -> Result<Solution, Interruption> {
         budget.check()?;
         let sparse = SparseProgram::new(program, None);
-        let answer = sparse.solve();
-        budget.check()?;
+        let answer = sparse.solve(budget)?;
         let mut solution = sparse.interpret(program, &answer);
         if solution.status == Status::Optimal
             && cut_off.is_some_and(|limit| solution.objective >= limit)
@@ -43,12 +57,18 @@ impl Solver for Clarabel {
 /// Least t >= 0 such that the program becomes feasible when every row of `family` (of unit
 /// length, or each component of the terminal point, or each input bound) is relaxed by t while
 /// all others hold; `None` if no t does.
-#[must_use]
-pub fn least_relaxation(program: &HorizonProgram<'_>, family: RelaxedFamily) -> Option<f64> {
+///
+/// # Errors
+/// The [`Interruption`] of the budget.
+pub fn least_relaxation(
+    program: &HorizonProgram<'_>,
+    family: RelaxedFamily,
+    budget: Budget<'_>,
+) -> Result<Option<f64>, Interruption> {
     let sparse = SparseProgram::new(program, Some(family));
-    let answer = sparse.solve();
-    matches!(answer.status, SolverStatus::Solved | SolverStatus::AlmostSolved)
-        .then(|| answer.x[sparse.layout.relaxation].max(0.0))
+    let answer = sparse.solve(budget)?;
+    Ok(matches!(answer.status, SolverStatus::Solved | SolverStatus::AlmostSolved)
+        .then(|| answer.x[sparse.layout.relaxation].max(0.0)))
 }
 
 /// What [`least_relaxation`] relaxes.
@@ -284,7 +304,7 @@ impl SparseProgram {
         }
     }
 
-    fn solve(&self) -> Answer {
+    fn solve(&self, budget: Budget<'_>) -> Result<Answer, Interruption> {
         // Tight first; long horizons sometimes stop short of that but reach the defaults.
         let tight = DefaultSettings {
             verbose: false,
@@ -294,23 +314,29 @@ impl SparseProgram {
             ..DefaultSettings::default()
         };
         let usual = DefaultSettings { verbose: false, ..DefaultSettings::default() };
-        let first = self.solve_with(tight);
+        let first = self.solve_with(tight, budget)?;
         if first.status == SolverStatus::Solved || first.status == SolverStatus::PrimalInfeasible {
-            return first;
+            return Ok(first);
         }
-        self.solve_with(usual)
+        self.solve_with(usual, budget)
     }
 
-    fn solve_with(&self, settings: DefaultSettings<f64>) -> Answer {
+    fn solve_with(
+        &self,
+        settings: DefaultSettings<f64>,
+        budget: Budget<'_>,
+    ) -> Result<Answer, Interruption> {
         let (rows, columns) = (self.right.len(), self.layout.end);
         let (i, j, v) = self.triplets.clone();
         let matrix = CscMatrix::new_from_triplets(rows, columns, i, j, v);
         let cones: [SupportedConeT<f64>; 2] =
             [ZeroConeT(self.equalities), NonnegativeConeT(rows - self.equalities)];
         let none = CscMatrix::zeros((columns, columns));
-        match DefaultSolver::new(&none, &self.objective, &matrix, &self.right, &cones, settings) {
+        let built =
+            DefaultSolver::new(&none, &self.objective, &matrix, &self.right, &cones, settings);
+        Ok(match built {
             Ok(mut solver) => {
-                solver.solve();
+                run(&mut solver, budget)?;
                 let solution = solver.solution;
                 Answer {
                     status: solution.status,
@@ -325,7 +351,7 @@ impl SparseProgram {
                 z: vec![0.0; rows],
                 iterations: 0,
             },
-        }
+        })
     }
 
     fn interpret(&self, program: &HorizonProgram<'_>, answer: &Answer) -> Solution {

@@ -320,7 +320,7 @@ impl RegulatorProgram<'_> {
         if matches!(solution.status, Status::Optimal | Status::PrimalInfeasible) {
             return Ok(self.answer(&solution, false));
         }
-        Ok(self.answer(&Clarabel.solve_quadratic(&program), true))
+        Ok(self.answer(&Clarabel.solve_quadratic(&program, budget)?, true))
     }
 
     /// The least t >= 0 that, added to the right side of every cut or of every facet, lets the
@@ -442,7 +442,8 @@ mod tests {
             rows: &condensed.rows,
             offsets: &condensed.offsets,
         };
-        let general = program.answer(&Clarabel.solve_quadratic(&quadratic), true);
+        let general = Clarabel.solve_quadratic(&quadratic, Budget::UNLIMITED).unwrap();
+        let general = program.answer(&general, true);
         assert!(!answer.by_general_solver);
         assert_eq!(answer.status, general.status);
         if answer.status == Status::Optimal {

@@ -3,12 +3,12 @@
 use ::clarabel::{
     algebra::CscMatrix,
     solver::{
-        DefaultSettings, DefaultSolver, IPSolver, SolverStatus,
+        DefaultSettings, DefaultSolver, SolverStatus,
         SupportedConeT::{self, NonnegativeConeT, SecondOrderConeT, ZeroConeT},
     },
 };
 
-use super::Status;
+use super::{Status, clarabel::run};
 use crate::budget::{Budget, Interruption};
 
 /// Minimise sum_j (quadratic_j x_j² + linear_j x_j) subject to rows in cones.
@@ -91,8 +91,8 @@ impl ConeProgram {
         }
     }
 
-    /// Solves, tight first and then to the solver's usual tolerance. Looks at the budget before
-    /// and after a solve, not within; iterations are bounded.
+    /// Solves, tight first and then to the solver's usual tolerance. Looks at the budget before a
+    /// solve and in every iteration; iterations are bounded.
     ///
     /// # Errors
     /// The [`Interruption`] of the budget.
@@ -105,17 +105,19 @@ impl ConeProgram {
             tol_feas: 1e-9,
             ..usual.clone()
         };
-        let first = self.solve_with(tight);
-        budget.check()?;
+        let first = self.solve_with(tight, budget)?;
         if first.status == Status::Optimal || first.status == Status::PrimalInfeasible {
             return Ok(first);
         }
-        let second = self.solve_with(usual);
-        budget.check()?;
+        let second = self.solve_with(usual, budget)?;
         Ok(ConeSolution { iterations: first.iterations + second.iterations, ..second })
     }
 
-    fn solve_with(&self, settings: DefaultSettings<f64>) -> ConeSolution {
+    fn solve_with(
+        &self,
+        settings: DefaultSettings<f64>,
+        budget: Budget<'_>,
+    ) -> Result<ConeSolution, Interruption> {
         let (rows, columns) = (self.constants.len(), self.linear.len());
         let (i, j, v) = self.triplets.clone();
         let matrix = CscMatrix::new_from_triplets(rows, columns, i, j, v);
@@ -132,9 +134,10 @@ impl ConeProgram {
             settings,
         );
         let Ok(mut solver) = solver else {
-            return ConeSolution { status: Status::NumericalFailure, x: Vec::new(), iterations: 0 };
+            let status = Status::NumericalFailure;
+            return Ok(ConeSolution { status, x: Vec::new(), iterations: 0 });
         };
-        solver.solve();
+        run(&mut solver, budget)?;
         let solution = solver.solution;
         let status = match solution.status {
             SolverStatus::Solved => Status::Optimal,
@@ -143,7 +146,7 @@ impl ConeProgram {
             SolverStatus::MaxIterations => Status::BudgetExhausted,
             _ => Status::NumericalFailure,
         };
-        ConeSolution { status, x: solution.x, iterations: solution.iterations as usize }
+        Ok(ConeSolution { status, x: solution.x, iterations: solution.iterations as usize })
     }
 }
 

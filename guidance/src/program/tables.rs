@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::anchors::Anchors;
+use crate::budget::{Budget, Interruption};
 
 /// A, B, bounds on the products A^i B, and the recursions in anchored form.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,11 +25,25 @@ impl PlantTables {
     /// For A (n x n), B (n x m) and horizons up to `horizon_max`.
     #[must_use]
     pub fn new(a: &DMatrix<f64>, b: &DMatrix<f64>, horizon_max: usize) -> Self {
+        Self::within(a, b, horizon_max, Budget::UNLIMITED).expect("this budget never interrupts")
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn within(
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        horizon_max: usize,
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
         let (n, m) = (a.nrows(), b.ncols());
         let by_rows = |x: &DMatrix<f64>| -> Vec<f64> { x.transpose().as_slice().to_vec() };
         let mut reach = vec![0.0; n];
         let mut response = b.clone();
         for j in 0..horizon_max {
+            budget.check()?;
             for r in 0..n {
                 let largest = response.row(r).amax();
                 reach.push(f64::max(reach[j * n + r], largest));
@@ -37,15 +52,15 @@ impl PlantTables {
         }
         let size = |r: &f64| if *r > 0.0 { *r } else { 1.0 };
         let units: Vec<f64> = reach[horizon_max * n..].iter().map(size).collect();
-        Self {
+        Ok(Self {
             n,
             m,
             a_columns: a.as_slice().to_vec(),
             a_rows: by_rows(a),
             b_columns: b.as_slice().to_vec(),
             reach,
-            anchors: Anchors::new(a, b, &units, horizon_max),
-        }
+            anchors: Anchors::new(a, b, &units, horizon_max, budget)?,
+        })
     }
 
     /// State components n.

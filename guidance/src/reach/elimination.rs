@@ -33,7 +33,7 @@ pub fn project_out_last(
 ) -> Result<HalfSpaces, EliminationError> {
     let mut rows = reduced(polytope, budget)?;
     for _ in 0..eliminated {
-        rows = reduced(&eliminate_one(&rows)?, budget)?;
+        rows = reduced(&eliminate_one(&rows, budget)?, budget)?;
     }
     Ok(rows)
 }
@@ -45,7 +45,7 @@ fn reduced(rows: &HalfSpaces, budget: Budget<'_>) -> Result<HalfSpaces, Eliminat
 }
 
 /// Every pair of rows that bound the last coordinate from both sides, added so that it cancels.
-fn eliminate_one(rows: &HalfSpaces) -> Result<HalfSpaces, EliminationError> {
+fn eliminate_one(rows: &HalfSpaces, budget: Budget<'_>) -> Result<HalfSpaces, EliminationError> {
     let n = rows.dimension() - 1;
     let last = |row: usize| rows.normal(row)[n] * rows.rows().scale(row);
     // A coordinate that is rounding against the rest of its row does not bound.
@@ -64,6 +64,7 @@ fn eliminate_one(rows: &HalfSpaces) -> Result<HalfSpaces, EliminationError> {
     }
     let mut normal = vec![0.0; n];
     for &above in &upper {
+        budget.check().map_err(NoInterior::from)?;
         for &below in &lower {
             // Weights that make the last coordinates +1 and -1.
             let (w, v) = (1.0 / rows.normal(above)[n], -1.0 / rows.normal(below)[n]);

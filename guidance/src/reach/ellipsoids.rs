@@ -4,9 +4,10 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, SMatrix};
 
+use super::reading::{ReadError, numbers};
 use crate::{
     budget::{Budget, Interruption},
-    bytes::{DecodeError, Reader, Writer},
+    bytes::{Reader, Writer},
     dynamics::{PeriodicPlant, RelativeVector, TransitionMatrix},
     matrices::product_fixed,
     sets::CentredEllipsoid,
@@ -21,6 +22,8 @@ const COUPLED: usize = 21;
 const PLANE: [usize; 4] = [0, 1, 3, 4];
 /// Components across it.
 const ACROSS: [usize; 2] = [2, 5];
+/// Instants between two looks at the budget.
+const BUDGET_PERIOD: usize = 1024;
 
 /// For every start k of a range and every instant t = 0 .. N s after it, the set of states at k
 /// that drift into the ellipsoid at that instant: {x : x' Phi' P Phi x <= 1}. Instants count the
@@ -55,7 +58,7 @@ impl EllipsoidUnion {
     /// The sets of the starts `starts` for a safety horizon of `horizon` steps.
     ///
     /// # Errors
-    /// The [`Interruption`] of the budget, asked for every start.
+    /// The [`Interruption`] of the budget.
     ///
     /// # Panics
     /// If the ellipsoid is not six-dimensional.
@@ -74,9 +77,11 @@ impl EllipsoidUnion {
         let terms = if mixes { COUPLED } else { DECOUPLED };
         let mut coefficients = vec![0.0; starts.len() * terms * instants];
         for (block, k) in coefficients.chunks_exact_mut(terms * instants).zip(starts.clone()) {
-            budget.check()?;
             let mut phi = TransitionMatrix::identity();
             for t in 0..instants {
+                if t % BUDGET_PERIOD == 0 {
+                    budget.check()?;
+                }
                 let (step, part) = (t / parts, t % parts);
                 if part == 0 {
                     if step > 0 {
@@ -93,20 +98,25 @@ impl EllipsoidUnion {
     }
 
     /// Puts ranges of starts that follow each other together; `None` if they do not.
-    #[must_use]
-    pub fn joined(parts: Vec<Self>) -> Option<Self> {
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn joined(parts: Vec<Self>, budget: Budget<'_>) -> Result<Option<Self>, Interruption> {
+        let numbers: usize = parts.iter().map(|part| part.coefficients.len()).sum();
         let mut parts = parts.into_iter();
-        let mut whole = parts.next()?;
+        let Some(mut whole) = parts.next() else { return Ok(None) };
+        whole.coefficients.reserve_exact(numbers - whole.coefficients.len());
         for part in parts {
+            budget.check()?;
             let follows = part.first == whole.first + whole.starts
                 && (part.instants, part.terms) == (whole.instants, whole.terms);
             if !follows {
-                return None;
+                return Ok(None);
             }
             whole.starts += part.starts;
             whole.coefficients.extend(part.coefficients);
         }
-        Some(whole)
+        Ok(Some(whole))
     }
 
     /// Number of starts.
@@ -207,23 +217,25 @@ impl EllipsoidUnion {
         writer.numbers(&self.coefficients);
     }
 
-    /// Reads what [`Self::write`] wrote, for so many starts from 0 and instants.
+    /// Reads what [`Self::write`] wrote, for the starts `starts` and so many instants.
     pub(crate) fn read(
         reader: &mut Reader<'_>,
-        starts: usize,
+        starts: Range<usize>,
         instants: usize,
-    ) -> Result<Self, DecodeError> {
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
         let union = Self {
             first: reader.count()?,
             starts: reader.count()?,
             instants: reader.count()?,
             terms: reader.count()?,
-            coefficients: reader.numbers()?,
+            coefficients: numbers(reader, budget)?,
         };
-        let sizes = (union.first, union.starts, union.instants) == (0, starts, instants)
+        let sizes = (union.first, union.starts, union.instants)
+            == (starts.start, starts.len(), instants)
             && [DECOUPLED, COUPLED].contains(&union.terms)
-            && union.coefficients.len() == starts * instants * union.terms;
-        if sizes { Ok(union) } else { Err(reader.fault("ellipsoids of another problem")) }
+            && union.coefficients.len() == starts.len() * instants * union.terms;
+        if sizes { Ok(union) } else { Err(reader.fault("ellipsoids of another problem").into()) }
     }
 
     fn block(&self, k: usize) -> &[f64] {
@@ -380,8 +392,9 @@ mod tests {
         let whole = EllipsoidUnion::new(&plant, &set, 20, 0..9, Budget::UNLIMITED).unwrap();
         let part =
             |starts| EllipsoidUnion::new(&plant, &set, 20, starts, Budget::UNLIMITED).unwrap();
-        assert_eq!(EllipsoidUnion::joined(vec![part(0..4), part(4..9)]), Some(whole));
-        assert_eq!(EllipsoidUnion::joined(vec![part(0..4), part(5..9)]), None);
-        assert_eq!(EllipsoidUnion::joined(Vec::new()), None);
+        let joined = |parts| EllipsoidUnion::joined(parts, Budget::UNLIMITED).unwrap();
+        assert_eq!(joined(vec![part(0..4), part(4..9)]), Some(whole));
+        assert_eq!(joined(vec![part(0..4), part(5..9)]), None);
+        assert_eq!(joined(Vec::new()), None);
     }
 }

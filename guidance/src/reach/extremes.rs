@@ -48,7 +48,7 @@ pub fn check_extremes(
     let mut check = ExtremeCheck::default();
     let Ok(cost) = QuadraticCost::new(DMatrix::identity(n, n) * PULL) else { return Ok(check) };
     let mut rooms = Vec::new();
-    all.rows().products(&about.point, &mut rooms);
+    all.rows().products_within(&about.point, &mut rooms, budget)?;
     rooms.iter_mut().zip(all.offsets()).for_each(|(room, b)| *room = b - *room);
     let mut at_centre = Vec::new();
     kept.rows().products(&about.point, &mut at_centre);
@@ -69,7 +69,7 @@ pub fn check_extremes(
             continue;
         }
         check.points += 1;
-        all.rows().products(&solution.point, &mut products);
+        all.rows().products_within(&solution.point, &mut products, budget)?;
         for (product, room) in products.iter().zip(&rooms) {
             check.excess = check.excess.max(product / room - 1.0);
         }

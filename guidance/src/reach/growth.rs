@@ -86,14 +86,14 @@ pub fn grow_control_invariant(
     })?;
     let interior = DVector::from_vec(interior.point);
     let corners =
-        vertices(&seed.to_polytope(), &interior, limits.facets_max).map_err(GrowthError::Hull)?;
-    let mut hull = Hull::new(&corners, limits.facets_max).map_err(GrowthError::Hull)?;
+        vertices(&seed.to_polytope(), &interior, limits.facets_max, budget).map_err(no_hull)?;
+    let mut hull = Hull::new(&corners, limits.facets_max, budget).map_err(no_hull)?;
     let cost =
         QuadraticCost::new(DMatrix::identity(feasible.dimension(), feasible.dimension()) * PULL)
             .map_err(|_| GrowthError::Numerical)?;
     let mut growth = Growth { set: seed.clone(), corners, rounds: 0, limited: false };
     for round in 0..limits.rounds {
-        let program = Reach::new(feasible, &growth.set, plant, &cost);
+        let program = Reach::new(feasible, &growth.set, plant, &cost, budget)?;
         let widths = half_widths(&growth.corners, &interior);
         let mut stream = Stream::new(0, 0, round as u64);
         let mut grown = false;
@@ -119,6 +119,13 @@ pub fn grow_control_invariant(
     Ok(growth)
 }
 
+fn no_hull(error: HullError) -> GrowthError {
+    match error {
+        HullError::Interrupted(why) => GrowthError::Interrupted(why),
+        other => GrowthError::Hull(other),
+    }
+}
+
 /// The states from which one step leads into a set.
 struct Reach<'a> {
     rows: DenseRows,
@@ -133,17 +140,18 @@ impl<'a> Reach<'a> {
         set: &HalfSpaces,
         plant: &[PlantVertex<'_>],
         cost: &'a QuadraticCost,
-    ) -> Self {
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
         let mut rows = feasible.rows().clone();
         let mut offsets = feasible.offsets().to_vec();
-        let first = step_back(set, plant);
+        let first = step_back(set, plant, budget)?;
         let mut normal = vec![0.0; feasible.dimension()];
         for row in 0..first.len() {
             normal[..first.dimension()].copy_from_slice(first.normal(row));
             rows.push(&normal);
             offsets.push(first.offset(row));
         }
-        Self { rows, offsets, cost, n: set.dimension() }
+        Ok(Self { rows, offsets, cost, n: set.dimension() })
     }
 
     /// A state far along `direction`; `None` if the solver could not prove its answer.

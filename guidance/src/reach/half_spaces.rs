@@ -2,8 +2,10 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::reading::{ReadError, numbers};
 use crate::{
     budget::{Budget, Interruption},
+    bytes::{Reader, Writer},
     program::{
         ActiveRow, DenseRows, DualActiveSet, QuadraticCost, QuadraticProgram, Status,
         prove_infeasible,
@@ -61,6 +63,10 @@ const ROOM_MIN: f64 = 1e-7;
 const ROOM_WANTED: f64 = 1.0;
 /// Weight of |x|^2 against the room: small, so that the point is central, not close to 0.
 const PULL: f64 = 1e-6;
+/// Rows between two looks at the budget.
+const BUDGET_PERIOD: usize = 1024;
+/// More coordinates are not read back: far above those of any program.
+const DIMENSION_MAX: usize = 100_000;
 
 impl HalfSpaces {
     /// The whole space of n dimensions.
@@ -99,12 +105,45 @@ impl HalfSpaces {
         (0..other.len()).for_each(|i| self.push(other.normal(i), other.offsets[i]));
     }
 
+    /// These rows and then those of `other`, if there is time.
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn with(&self, other: &Self, budget: Budget<'_>) -> Result<Self, Interruption> {
+        let mut both = Self::new(self.dimension());
+        for rows in [self, other] {
+            for first in (0..rows.len()).step_by(BUDGET_PERIOD) {
+                budget.check()?;
+                let last = (first + BUDGET_PERIOD).min(rows.len());
+                (first..last).for_each(|i| both.push(rows.normal(i), rows.offsets[i]));
+            }
+        }
+        Ok(both)
+    }
+
     /// The rows with these indices, in this order.
     #[must_use]
     pub fn select(&self, indices: &[usize]) -> Self {
         let mut selected = Self::new(self.dimension());
         indices.iter().for_each(|&i| selected.push(self.normal(i), self.offsets[i]));
         selected
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn select_within(
+        &self,
+        indices: &[usize],
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
+        let mut selected = Self::new(self.dimension());
+        for some in indices.chunks(BUDGET_PERIOD) {
+            budget.check()?;
+            some.iter().for_each(|&i| selected.push(self.normal(i), self.offsets[i]));
+        }
+        Ok(selected)
     }
 
     /// n.
@@ -169,13 +208,42 @@ impl HalfSpaces {
     }
 
     /// Least distance of `point` to a row, per unit normal; negative outside, infinite without rows.
-    #[must_use]
-    pub fn room(&self, point: &[f64]) -> f64 {
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn room(&self, point: &[f64], budget: Budget<'_>) -> Result<f64, Interruption> {
         let mut products = Vec::with_capacity(self.len());
-        self.rows.products(point, &mut products);
-        (0..self.len())
+        self.rows.products_within(point, &mut products, budget)?;
+        Ok((0..self.len())
             .map(|i| (self.offsets[i] - products[i]) * self.rows.scale(i))
-            .fold(f64::INFINITY, f64::min)
+            .fold(f64::INFINITY, f64::min))
+    }
+
+    /// Appends the rows.
+    pub(crate) fn write(&self, writer: &mut Writer) {
+        writer.count(self.dimension());
+        writer.numbers(&self.offsets);
+        for row in 0..self.len() {
+            self.normal(row).iter().for_each(|&entry| writer.number(entry));
+        }
+    }
+
+    /// Reads what [`Self::write`] wrote.
+    pub(crate) fn read(reader: &mut Reader<'_>, budget: Budget<'_>) -> Result<Self, ReadError> {
+        let dimension = reader.count()?;
+        if dimension > DIMENSION_MAX {
+            return Err(reader.fault("too many coordinates").into());
+        }
+        let offsets = numbers(reader, budget)?;
+        let mut rows = Self::new(dimension);
+        for (row, offset) in offsets.into_iter().enumerate() {
+            if row % BUDGET_PERIOD == 0 {
+                budget.check()?;
+            }
+            let normal = (0..dimension).map(|_| reader.number());
+            rows.push(&normal.collect::<Result<Vec<_>, _>>()?, offset);
+        }
+        Ok(rows)
     }
 
     /// A point with much room to every row: the centre of a large ball inside, of radius 1 if
@@ -198,6 +266,9 @@ impl HalfSpaces {
         let mut lifted = DenseRows::new(n + 1);
         let mut normal = vec![0.0; n + 1];
         for row in 0..self.len() {
+            if row % BUDGET_PERIOD == 0 {
+                budget.check()?;
+            }
             normal[..n].copy_from_slice(self.normal(row));
             normal[n] = 1.0 / self.rows.scale(row);
             lifted.push(&normal);
@@ -219,7 +290,7 @@ impl HalfSpaces {
         }
         let point = solution.point[..n].to_vec();
         // The room is measured, not believed.
-        let room = self.room(&point).min(ROOM_WANTED);
+        let room = self.room(&point, budget)?.min(ROOM_WANTED);
         Ok(InteriorPoint { point, room })
     }
 

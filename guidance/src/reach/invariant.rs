@@ -75,7 +75,10 @@ pub fn max_robust_positive_invariant(
     limits: InvariantLimits,
     budget: Budget<'_>,
 ) -> Invariant {
-    let found = max_invariant(constraints, limits, budget, |set, _| Ok(step_back(set, vertices)));
+    let back = |set: &HalfSpaces, budget: Budget<'_>| {
+        step_back(set, vertices, budget).map_err(|why| NoInterior::from(why).into())
+    };
+    let found = max_invariant(constraints, limits, budget, back);
     found.unwrap_or_else(Invariant::from_end)
 }
 
@@ -103,7 +106,7 @@ pub fn max_robust_control_invariant(
     };
     let back = |set: &HalfSpaces, budget: Budget<'_>| {
         let mut both = constraints.clone();
-        both.extend(&step_back(set, vertices));
+        both.extend(&step_back(set, vertices, budget).map_err(NoInterior::from)?);
         project_out_last(&both, inputs, budget)
     };
     max_invariant(&start, limits, budget, back).unwrap_or_else(Invariant::from_end)
@@ -180,12 +183,19 @@ fn max_invariant(
 
 /// {(x, u) : A_j x + B_j u + w in the set for every j and w}: every row times every vertex, its
 /// offset less the support of the disturbance.
-#[must_use]
-pub fn step_back(set: &HalfSpaces, vertices: &[PlantVertex<'_>]) -> HalfSpaces {
+///
+/// # Errors
+/// The [`Interruption`] of the budget.
+pub fn step_back(
+    set: &HalfSpaces,
+    vertices: &[PlantVertex<'_>],
+    budget: Budget<'_>,
+) -> Result<HalfSpaces, Interruption> {
     let columns = vertices.first().map_or(0, |v| v.a.ncols() + v.b.ncols());
     let mut rows = HalfSpaces::new(columns);
     let mut normal = vec![0.0; columns];
     for row in 0..set.len() {
+        budget.check()?;
         let direction = DVector::from_column_slice(set.normal(row));
         for vertex in vertices {
             for (c, column) in vertex.a.column_iter().chain(vertex.b.column_iter()).enumerate() {
@@ -195,5 +205,5 @@ pub fn step_back(set: &HalfSpaces, vertices: &[PlantVertex<'_>]) -> HalfSpaces {
             rows.push(&normal, set.offset(row) - taken);
         }
     }
-    rows
+    Ok(rows)
 }

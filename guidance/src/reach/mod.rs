@@ -13,6 +13,7 @@ mod half_spaces;
 mod invariant;
 mod passive;
 mod polytopes;
+mod reading;
 mod redundancy;
 mod sampled_constraints;
 mod scenario;
@@ -34,6 +35,7 @@ pub use invariant::{
 pub(crate) use passive::passive_safety_along;
 pub use passive::{DriftVerdict, PassiveQuestion, PassiveVerdict, passive_safety};
 pub use polytopes::{PolytopeQuestion, PolytopeUnion, ReachablePolytope};
+pub use reading::ReadError;
 pub use redundancy::{EXACT, Reduction, irredundant, irredundant_about};
 pub use sampled_constraints::{StageConstraints, StageFamily, StageGroup};
 pub use scenario::{Context, GroupPart, SampledRows, Scenario, Survivors};

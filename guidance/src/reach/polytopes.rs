@@ -4,9 +4,10 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector, SMatrix, Vector3};
 
+use super::reading::{ReadError, items, numbers};
 use crate::{
     budget::{Budget, Interruption},
-    bytes::{DecodeError, Reader, Writer},
+    bytes::{Reader, Writer},
     dynamics::{HeldStep, PeriodicPlant, RelativeVector},
     matrices::product_fixed,
     program::polytope_is_empty,
@@ -76,7 +77,7 @@ impl PolytopeUnion {
     /// The sets of the starts `starts`.
     ///
     /// # Errors
-    /// The [`Interruption`] of the budget, asked for every instant at which sets end.
+    /// The [`Interruption`] of the budget.
     ///
     /// # Panics
     /// If the polytope is not six-dimensional.
@@ -187,35 +188,40 @@ impl PolytopeUnion {
         }
     }
 
-    /// Reads what [`Self::write`] wrote, for so many starts from 0, modes and instants.
+    /// Reads what [`Self::write`] wrote, for the starts `starts` and so many rows, modes and
+    /// instants.
     pub(crate) fn read(
         reader: &mut Reader<'_>,
-        starts: usize,
+        starts: Range<usize>,
+        rows: usize,
         modes: usize,
         instants: usize,
-    ) -> Result<Self, DecodeError> {
-        let (first, rows) = (reader.count()?, reader.count()?);
-        let sizes = (first, reader.count()?, reader.count()?);
-        if sizes != (0, modes, starts) {
-            return Err(reader.fault("polytopes of another problem"));
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
+        let sizes = [reader.count()?, reader.count()?, reader.count()?, reader.count()?];
+        if sizes != [starts.start, rows, modes, starts.len()] {
+            return Err(reader.fault("polytopes of another problem").into());
         }
-        let start = |reader: &mut Reader<'_>| -> Result<StartSets, DecodeError> {
+        let start = |reader: &mut Reader<'_>| -> Result<StartSets, ReadError> {
+            budget.check()?;
             let kept = reader.small_counts()?;
             let count = reader.count()?;
-            let sets = (0..count)
-                .map(|_| match reader.small_counts()?[..] {
-                    [place, mode] if place < kept.len() && mode < modes => Ok((place, mode)),
-                    _ => Err(reader.fault("a set of no instant or mode")),
-                })
-                .collect::<Result<Vec<_>, _>>()?;
-            let found =
-                StartSets { normals: reader.numbers()?, kept, sets, offsets: reader.numbers()? };
+            let set = |reader: &mut Reader<'_>| match reader.small_counts()?[..] {
+                [place, mode] if place < kept.len() && mode < modes => Ok((place, mode)),
+                _ => Err(reader.fault("a set of no instant or mode")),
+            };
+            let sets = items(count, reader, budget, set)?;
+            let (normals, offsets) = (numbers(reader, budget)?, numbers(reader, budget)?);
+            let found = StartSets { normals, kept, sets, offsets };
             let fits = found.normals.len() == found.kept.len() * rows * 6
                 && found.offsets.len() == found.sets.len() * rows
-                && found.kept.iter().all(|&instant| instant < instants);
-            if fits { Ok(found) } else { Err(reader.fault("sets of other sizes")) }
+                && found.kept.iter().all(|&instant| instant < instants)
+                && found.kept.is_sorted_by(|a, b| a < b)
+                && found.sets.is_sorted_by(|a, b| a < b);
+            if fits { Ok(found) } else { Err(reader.fault("sets of other sizes").into()) }
         };
-        let starts = (0..starts).map(|_| start(reader)).collect::<Result<_, _>>()?;
+        let first = starts.start;
+        let starts = starts.map(|_| start(reader)).collect::<Result<_, _>>()?;
         Ok(Self { first, rows, modes, starts })
     }
 
@@ -363,14 +369,13 @@ fn visit_sets(
     }
     for end in starts.start..starts.end + horizon {
         for part in 0..parts {
-            budget.check()?;
             let mut chain = Chain::new(question);
             if part > 0 {
-                chain.back(question, &emptiness, question.plant.fraction(end, part));
+                chain.back(question, &emptiness, question.plant.fraction(end, part), budget)?;
             }
             for start in (starts.start.max(end.saturating_sub(horizon))..=end).rev() {
                 if start < end {
-                    chain.back(question, &emptiness, question.plant.step(start));
+                    chain.back(question, &emptiness, question.plant.step(start), budget)?;
                 }
                 if chain.sets() == 0 {
                     break;
@@ -410,7 +415,14 @@ impl Chain {
 
     /// One step of (20): H <- H A, l <- min over u of l - H B u, which takes each working
     /// thruster's push along the row.
-    fn back(&mut self, question: &PolytopeQuestion<'_>, emptiness: &Emptiness, step: &HeldStep) {
+    fn back(
+        &mut self,
+        question: &PolytopeQuestion<'_>,
+        emptiness: &Emptiness,
+        step: &HeldStep,
+        budget: Budget<'_>,
+    ) -> Result<(), Interruption> {
+        budget.check()?;
         for (i, row) in self.normals.iter_mut().enumerate() {
             let along = product_fixed(row, &step.b);
             let push: Vec<f64> = question
@@ -426,9 +438,13 @@ impl Chain {
             *row = product_fixed(row, &step.a);
         }
         for offsets in &mut self.offsets {
+            if matches!(emptiness, Emptiness::General(_)) {
+                budget.check()?;
+            }
             if offsets.as_ref().is_some_and(|offsets| emptiness.is_empty(offsets)) {
                 *offsets = None;
             }
         }
+        Ok(())
     }
 }

@@ -31,8 +31,12 @@ const MISFIT_MAX: f64 = 1e-8;
 const RECENT_MAX: usize = 96;
 /// Below so many candidates a box around the set does not pay.
 const DOMINANCE_WORTHWHILE: usize = 500;
-/// Rows between two looks at the budget.
+/// Rows between two looks at the budget where each may need a program.
 const BUDGET_PERIOD: usize = 64;
+/// The same where each takes a few products.
+const ROWS_BETWEEN_LOOKS: usize = 1024;
+/// The same where each takes one.
+const PRODUCTS_BETWEEN_LOOKS: usize = 16_384;
 
 /// What is left of a set of rows, and what that costs.
 #[derive(Debug, Clone, PartialEq)]
@@ -72,8 +76,7 @@ pub fn irredundant(
     tolerance: f64,
     budget: Budget<'_>,
 ) -> Result<Reduction, NoInterior> {
-    let mut all = candidates.clone();
-    all.extend(context);
+    let all = candidates.with(context, budget)?;
     let interior = all.interior_point(budget)?;
     reduce(candidates.len(), &all, interior, tolerance, budget)
 }
@@ -91,9 +94,8 @@ pub fn irredundant_about(
     tolerance: f64,
     budget: Budget<'_>,
 ) -> Result<Reduction, NoInterior> {
-    let mut all = candidates.clone();
-    all.extend(context);
-    if !(all.room(&point.point) > 0.0) {
+    let all = candidates.with(context, budget)?;
+    if !(all.room(&point.point, budget)? > 0.0) {
         return Err(NoInterior::Numerical);
     }
     reduce(candidates.len(), &all, point.clone(), tolerance, budget)
@@ -107,7 +109,7 @@ fn reduce(
     tolerance: f64,
     budget: Budget<'_>,
 ) -> Result<Reduction, NoInterior> {
-    let mut search = Search::new(all, candidates, &interior, tolerance)?;
+    let mut search = Search::new(all, candidates, &interior, tolerance, budget)?;
     if candidates < all.len() && candidates > DOMINANCE_WORTHWHILE {
         // Only rows that stay may carry the box, or rows could remove each other.
         search.dominance = Dominance::new(&search.context_rows(), budget)?;
@@ -118,7 +120,7 @@ fn reduce(
             budget.tell(row, candidates);
         }
         if search.fate[row] == Fate::Open {
-            search.decide(row);
+            search.decide(row, budget)?;
         }
     }
     if search.ties {
@@ -157,24 +159,38 @@ struct Search {
 }
 
 /// Every row times the matrix: M a_i.
-fn mapped(rows: &DenseRows, matrix: &DMatrix<f64>) -> DenseRows {
+fn mapped(
+    rows: &DenseRows,
+    matrix: &DMatrix<f64>,
+    budget: Budget<'_>,
+) -> Result<DenseRows, Interruption> {
     let by_rows = DenseRows::from_matrix(matrix);
     let mut image = DenseRows::new(matrix.nrows());
     let mut normal = Vec::with_capacity(matrix.nrows());
     for row in 0..rows.len() {
+        if row % ROWS_BETWEEN_LOOKS == 0 {
+            budget.check()?;
+        }
         by_rows.products(rows.normal(row), &mut normal);
         image.push(&normal);
     }
-    image
+    Ok(image)
 }
 
 /// Orthonormal axes, one a row, along which rows differ from the multiple of the row before that
 /// is nearest to them.
-fn axes_of_differences(rows: &DenseRows, candidates: usize) -> DMatrix<f64> {
+fn axes_of_differences(
+    rows: &DenseRows,
+    candidates: usize,
+    budget: Budget<'_>,
+) -> Result<DMatrix<f64>, Interruption> {
     let n = rows.columns();
     let mut spread = DMatrix::<f64>::zeros(n, n);
     let mut rest = vec![0.0; n];
     for row in 1..candidates {
+        if row % ROWS_BETWEEN_LOOKS == 0 {
+            budget.check()?;
+        }
         let (before, this) = (rows.normal(row - 1), rows.normal(row));
         let square: f64 = before.iter().map(|a| a * a).sum();
         let along: f64 = before.iter().zip(this).map(|(a, b)| a * b).sum();
@@ -191,7 +207,7 @@ fn axes_of_differences(rows: &DenseRows, candidates: usize) -> DMatrix<f64> {
         }
     }
     let axes = spread.symmetric_eigen().eigenvectors.transpose();
-    if axes.iter().all(|x| x.is_finite()) { axes } else { DMatrix::identity(n, n) }
+    Ok(if axes.iter().all(|x| x.is_finite()) { axes } else { DMatrix::identity(n, n) })
 }
 
 /// How a feasibility program ended.
@@ -208,12 +224,16 @@ impl Search {
         candidates: usize,
         interior: &InteriorPoint,
         tolerance: f64,
+        budget: Budget<'_>,
     ) -> Result<Self, NoInterior> {
         let n = all.dimension();
         let mut polar = DenseRows::new(n);
         let mut moments = DMatrix::zeros(n, n);
         let mut normal = vec![0.0; n];
         for row in 0..all.len() {
+            if row % ROWS_BETWEEN_LOOKS == 0 {
+                budget.check()?;
+            }
             let a = all.normal(row);
             let at: f64 = a.iter().zip(&interior.point).map(|(a, z)| a * z).sum();
             let room = all.offset(row) - at;
@@ -232,10 +252,11 @@ impl Search {
         let metric = QuadraticCost::new(moments + DMatrix::identity(n, n) * floor)
             .map_err(|_| NoInterior::Numerical)?;
         let whiten = DMatrix::from_fn(n, n, |k, i| metric.factor_column(k)[i]);
-        let round = mapped(&polar, &whiten);
+        let round = mapped(&polar, &whiten, budget)?;
         // Turned so that neighbours differ along few axes: then a box along the axes is tight for
         // what they differ by.
-        let round = mapped(&round, &axes_of_differences(&round, candidates));
+        let axes = axes_of_differences(&round, candidates, budget)?;
+        let round = mapped(&round, &axes, budget)?;
         Ok(Self {
             fate: vec![Fate::Open; candidates],
             needed: (candidates..all.len()).collect(),
@@ -262,22 +283,22 @@ impl Search {
     }
 
     /// Settles the fate of an open row, and finds other needed rows on the way.
-    fn decide(&mut self, row: usize) {
+    fn decide(&mut self, row: usize, budget: Budget<'_>) -> Result<(), Interruption> {
         if self.polar.normal(row).iter().all(|&a| a == 0.0) {
             // 0 <= b with b > 0, since the interior point satisfies it.
             self.fate[row] = Fate::Removed;
-            return;
+            return Ok(());
         }
         let Self { dominance, polar, tolerance, .. } = self;
         let behind = dominance.as_mut().and_then(|front| front.excess(polar, row, *tolerance));
         if let Some(excess) = behind {
             self.outer_excess = self.outer_excess.max(excess);
             self.fate[row] = Fate::Removed;
-            return;
+            return Ok(());
         }
         self.begin(row);
         loop {
-            match self.against_needed(row, None) {
+            match self.against_needed(row, None, budget)? {
                 Outcome::Redundant => self.fate[row] = Fate::Removed,
                 Outcome::Doubtful => {
                     self.doubtful += 1;
@@ -285,7 +306,7 @@ impl Search {
                     self.needed.push(row);
                 }
                 Outcome::Open => {
-                    let worst = self.worst_of_open(row);
+                    let worst = self.worst_of_open(row, budget)?;
                     self.fate[worst] = Fate::Needed;
                     self.needed.push(worst);
                     self.touch(worst);
@@ -295,7 +316,7 @@ impl Search {
                 }
             }
             if self.fate[row] != Fate::Open {
-                return;
+                return Ok(());
             }
         }
     }
@@ -310,24 +331,30 @@ impl Search {
     }
 
     /// Goes on until the needed rows are satisfied or exclude the row; `without` is left out.
-    fn against_needed(&mut self, row: usize, without: Option<usize>) -> Outcome {
+    fn against_needed(
+        &mut self,
+        row: usize,
+        without: Option<usize>,
+        budget: Budget<'_>,
+    ) -> Result<Outcome, Interruption> {
         let iterations_max = 60 * (self.cost.variables() + 5);
         while let Some(worst) = self.worst_of_needed(without) {
+            budget.check()?;
             let Self { active, polar, .. } = self;
             match active.enter(worst, polar.normal(worst), 1.0, iterations_max) {
                 Entry::Active => {}
-                Entry::Infeasible => return self.certify(row, worst),
-                Entry::Stalled => return Outcome::Doubtful,
+                Entry::Infeasible => return Ok(self.certify(row, worst)),
+                Entry::Stalled => return Ok(Outcome::Doubtful),
             }
             if !self.active.point().iter().all(|y| y.is_finite()) {
-                return Outcome::Doubtful;
+                return Ok(Outcome::Doubtful);
             }
             if let Some(excess) = self.proved_by_the_box(row) {
                 self.outer_excess = self.outer_excess.max(excess);
-                return Outcome::Redundant;
+                return Ok(Outcome::Redundant);
             }
         }
-        Outcome::Open
+        Ok(Outcome::Open)
     }
 
     /// Before the search ends: the active rows combine to nearly a_row, and what is missing is
@@ -374,12 +401,15 @@ impl Search {
 
     /// The open row with the largest a_i y: the ray to y leaves the set through it. `row` itself
     /// wins ties, and duplicates of it are removed by it later.
-    fn worst_of_open(&mut self, row: usize) -> usize {
+    fn worst_of_open(&mut self, row: usize, budget: Budget<'_>) -> Result<usize, Interruption> {
         self.polar.pad(self.active.point(), &mut self.padded);
         let own = self.polar.product(row, &self.padded);
         let mut worst = (own, row);
         let mut tie = false;
         for other in 0..self.candidates {
+            if other % PRODUCTS_BETWEEN_LOOKS == 0 {
+                budget.check()?;
+            }
             if self.fate[other] != Fate::Open || other == row {
                 continue;
             }
@@ -392,7 +422,7 @@ impl Search {
             }
         }
         self.ties |= tie;
-        worst.1
+        Ok(worst.1)
     }
 
     /// Is the ray a certificate, by its own arithmetic? a_row = sum y_j a_j with y >= 0 and
@@ -445,7 +475,7 @@ impl Search {
             }
             budget.check()?;
             self.begin(row);
-            if matches!(self.against_needed(row, Some(row)), Outcome::Redundant) {
+            if matches!(self.against_needed(row, Some(row), budget)?, Outcome::Redundant) {
                 self.fate[row] = Fate::Removed;
                 self.needed.remove(place);
                 self.recent.retain(|&other| other != row);

@@ -7,11 +7,12 @@
 use nalgebra::DMatrix;
 
 use super::{
-    EXACT, ExtremeCheck, HalfSpaces, InteriorPoint, NoInterior, Reduction, StageConstraints,
-    StageFamily, StageGroup, check_extremes, irredundant, irredundant_about,
+    EXACT, ExtremeCheck, HalfSpaces, InteriorPoint, NoInterior, ReadError, Reduction,
+    StageConstraints, StageFamily, StageGroup, check_extremes, irredundant, irredundant_about,
 };
 use crate::{
     budget::{Budget, Interruption},
+    bytes::{Reader, Writer},
     dynamics::{PlantMatrices, Prediction, UncertainPlant},
     sampling::{ScalarLaw, Stream},
 };
@@ -20,8 +21,6 @@ use crate::{
 const CONTEXT_SAMPLES: usize = 12;
 /// Rows that cut off less than this are not chosen: any choice would do, and a small one is fast.
 const CONTEXT_TOLERANCE: f64 = 0.05;
-/// Samples between two looks at the budget.
-const BUDGET_PERIOD: usize = 64;
 /// Share of the terminal set's inner point in the point that rows are measured about: whatever is
 /// sampled leaves room there, because the terminal set is invariant without corrections.
 const TERMINAL_SHARE: f64 = 0.2;
@@ -123,9 +122,8 @@ impl Survivors {
         groups: impl Fn(usize) -> usize,
         budget: Budget<'_>,
     ) -> Result<Self, NoInterior> {
-        let rows = candidates.select(&reduction.kept);
-        let mut left = rows.clone();
-        left.extend(context);
+        let rows = candidates.select_within(&reduction.kept, budget)?;
+        let left = rows.with(context, budget)?;
         let centre = &reduction.interior;
         let check = check_extremes(&left, candidates, centre, CHECKED_POINTS, budget)?;
         Ok(Self {
@@ -133,6 +131,39 @@ impl Survivors {
             outer_excess: reduction.outer_excess,
             doubtful: reduction.doubtful,
             check,
+        })
+    }
+
+    /// Appends what is left of one part, whose rows are all of one group.
+    pub(crate) fn write(&self, writer: &mut Writer) {
+        self.rows.rows.write(writer);
+        writer.number(self.outer_excess);
+        writer.count(self.doubtful);
+        writer.count(self.check.points);
+        // A row that a point violates without end.
+        let excess = Some(self.check.excess).filter(|excess| excess.is_finite());
+        writer.option(excess, Writer::number);
+    }
+
+    /// Reads what [`Self::write`] wrote of a part of `group`, for rows of so many coordinates.
+    pub(crate) fn read(
+        reader: &mut Reader<'_>,
+        group: usize,
+        dimension: usize,
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
+        let rows = HalfSpaces::read(reader, budget)?;
+        if rows.dimension() != dimension {
+            return Err(reader.fault("rows of another problem").into());
+        }
+        Ok(Self {
+            rows: SampledRows { groups: vec![group; rows.len()], rows },
+            outer_excess: reader.number()?,
+            doubtful: reader.count()?,
+            check: ExtremeCheck {
+                points: reader.count()?,
+                excess: reader.option(Reader::number)?.unwrap_or(f64::INFINITY),
+            },
         })
     }
 
@@ -178,9 +209,7 @@ impl Scenario<'_> {
         let (m, n) = self.gain.shape();
         let mut rows = HalfSpaces::new(n + self.horizon * m);
         for sample in samples.take(if certain { 1 } else { usize::MAX }) {
-            if sample % BUDGET_PERIOD == 0 {
-                budget.check()?;
-            }
+            budget.check()?;
             let prediction = self.prediction(part.group as u64, sample, stage_group.steps());
             self.constraints.push_rows(stage_group, &chosen, &prediction, &mut rows);
         }
@@ -189,7 +218,7 @@ impl Scenario<'_> {
         let count = chosen.len().max(1);
         let order: Vec<usize> =
             (0..count).flat_map(|face| (face..rows.len()).step_by(count)).collect();
-        Ok(rows.select(&order))
+        rows.select_within(&order, budget)
     }
 
     /// Rows of all groups, had none been removed.
@@ -227,7 +256,7 @@ impl Scenario<'_> {
             .map(|(ball, terminal)| ball + TERMINAL_SHARE * (terminal - ball))
             .collect();
         let rows = all.select(&reduction.kept);
-        let room = rows.rows.room(&point);
+        let room = rows.rows.room(&point, budget)?;
         Ok(Context { rows, centre: InteriorPoint { point, room } })
     }
 
@@ -243,7 +272,7 @@ impl Scenario<'_> {
         budget: Budget<'_>,
     ) -> Result<Survivors, NoInterior> {
         let rows = self.rows(part, 0..self.sizes[part.group], budget)?;
-        let rows = nearest_first(&rows, self.sizes[part.group], &context.centre);
+        let rows = nearest_first(&rows, self.sizes[part.group], &context.centre, budget)?;
         let beside = &context.rows.rows;
         let reduction = irredundant_about(&context.centre, &rows, beside, tolerance, budget)?;
         Survivors::new(&reduction, &rows, beside, |_| part.group, budget)
@@ -262,6 +291,7 @@ impl Scenario<'_> {
     ) -> Result<Survivors, NoInterior> {
         let mut all = context.rows.select(&[]);
         for part in parts {
+            budget.check()?;
             all.extend(&part.rows.rows, part.rows.groups.iter().copied());
         }
         let groups = |index| all.groups[index];
@@ -287,13 +317,19 @@ impl Scenario<'_> {
 }
 
 /// Bundles of `size` rows each, those nearest to the point first: later ones lie behind them.
-fn nearest_first(rows: &HalfSpaces, size: usize, about: &InteriorPoint) -> HalfSpaces {
+fn nearest_first(
+    rows: &HalfSpaces,
+    size: usize,
+    about: &InteriorPoint,
+    budget: Budget<'_>,
+) -> Result<HalfSpaces, Interruption> {
     let mut products = Vec::with_capacity(rows.len());
-    rows.rows().products(&about.point, &mut products);
+    rows.rows().products_within(&about.point, &mut products, budget)?;
     let distance = |row: usize| (rows.offset(row) - products[row]) * rows.rows().scale(row);
     let mut order: Vec<usize> = (0..rows.len()).collect();
     for bundle in order.chunks_mut(size.max(1)) {
+        budget.check()?;
         bundle.sort_by(|&a, &b| distance(a).total_cmp(&distance(b)).then(a.cmp(&b)));
     }
-    rows.select(&order)
+    rows.select_within(&order, budget)
 }

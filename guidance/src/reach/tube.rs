@@ -2,7 +2,11 @@
 
 use nalgebra::{DMatrix, DVector, DVectorView, Vector3};
 
-use crate::{matrices::product, sets::Zonotope};
+use crate::{
+    budget::{Budget, Interruption},
+    matrices::product,
+    sets::Zonotope,
+};
 
 /// The sums are stopped when every entry of A_K^i G and K A_K^i G is below this, so the tail that
 /// is left out is below rounding. Stated in the artifact.
@@ -11,6 +15,8 @@ const SERIES_TOLERANCE: f64 = 1e-18;
 const SERIES_TERMS_MAX: usize = 5000;
 /// Most generators for which the supremum in [`Tube::decrease`] is enumerated.
 const ENUMERATED_GENERATORS_MAX: usize = 14;
+/// Most products in that enumeration: a few seconds. A loop that contracts slowly has many terms.
+const ENUMERATED_PRODUCTS_MAX: usize = 4_000_000_000;
 
 /// The tube of a loop A_K = A + B K under disturbances in W. [Quartullo2025a, eq. 15], where
 /// "A_i^k" must read A_K^i; [Quartullo2025b, eq. 6].
@@ -25,10 +31,22 @@ pub struct Tube {
     positions: Vec<Vector3<f64>>,
 }
 
-/// The loop does not contract.
+/// Why there is no tube.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("A + B K does not contract below 1e-18 within {SERIES_TERMS_MAX} steps")]
-pub struct TubeError;
+pub enum TubeError {
+    /// The loop does not contract.
+    #[error("A + B K does not contract below 1e-18 within {SERIES_TERMS_MAX} steps")]
+    NoContraction,
+    /// Stopped from outside.
+    #[error("stopped: {0:?}")]
+    Interrupted(Interruption),
+}
+
+impl From<Interruption> for TubeError {
+    fn from(interruption: Interruption) -> Self {
+        Self::Interrupted(interruption)
+    }
+}
 
 /// By how much the optimal cost falls at each step at least.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,11 +61,12 @@ impl Tube {
     /// For A_K (n x n), K (m x n) and W.
     ///
     /// # Errors
-    /// [`TubeError`] if the powers of A_K do not vanish.
+    /// [`TubeError`]: the powers of A_K do not vanish, or the budget ended.
     pub fn new(
         closed_loop: &DMatrix<f64>,
         gain: &DMatrix<f64>,
         disturbance: &Zonotope,
+        budget: Budget<'_>,
     ) -> Result<Self, TubeError> {
         let mut powers = Vec::new();
         let mut fed_back = Vec::new();
@@ -55,6 +74,7 @@ impl Tube {
         let mut power = DMatrix::identity(closed_loop.nrows(), closed_loop.ncols());
         let mut generators = disturbance.generators().clone();
         for _ in 0..SERIES_TERMS_MAX {
+            budget.check()?;
             let seen = product(gain, &generators);
             let size = generators.iter().chain(seen.iter()).fold(0.0_f64, |a, x| a.max(x.abs()));
             if power.amax() < 1.0 && size < SERIES_TOLERANCE {
@@ -69,14 +89,25 @@ impl Tube {
                 return Ok(Self { powers, fed_back, positions });
             }
             if !(power.amax() < 1e30) {
-                return Err(TubeError);
+                return Err(TubeError::NoContraction);
             }
             powers.push(generators.clone());
             fed_back.push(seen);
             generators = product(closed_loop, &generators);
             power = product(closed_loop, &power);
         }
-        Err(TubeError)
+        Err(TubeError::NoContraction)
+    }
+
+    /// Bytes of a tube whose sums are as long as they may be, for n states, m inputs and so many
+    /// generators.
+    #[must_use]
+    pub fn bytes_max(n: usize, m: usize, generators: usize) -> usize {
+        // A generator's image, what is fed back of it, its position.
+        let numbers = generators.saturating_mul(n.saturating_add(m).saturating_add(3));
+        let term = numbers.saturating_mul(size_of::<f64>());
+        let term = term.saturating_add(2 * size_of::<DMatrix<f64>>());
+        term.saturating_mul(SERIES_TERMS_MAX)
     }
 
     /// Terms kept of the infinite sums.
@@ -161,41 +192,58 @@ impl Tube {
     /// [Quartullo2025a, eq. 23; Quartullo2025b, eq. 14]
     ///
     /// The supremum of a convex function over a zonotope is at a sign combination of its
-    /// generators: enumerated up to 14 of them, else bounded by the sum over the generators.
-    #[must_use]
-    pub fn decrease(&self, fuel: f64, tracking: f64) -> Decrease {
+    /// generators: enumerated up to 14 of them where that does not take too long, else bounded by
+    /// the sum over the generators.
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn decrease(
+        &self,
+        fuel: f64,
+        tracking: f64,
+        budget: Budget<'_>,
+    ) -> Result<Decrease, Interruption> {
         let p = self.powers.first().map_or(0, DMatrix::ncols);
         if p == 0 || (fuel == 0.0 && tracking == 0.0) {
-            return Decrease { lambda_bar: 1.0, exact: true };
+            return Ok(Decrease { lambda_bar: 1.0, exact: true });
         }
         let weigh = |combine: &dyn Fn(&DMatrix<f64>) -> f64| {
             let tracked: f64 = self.powers.iter().map(combine).sum();
             let spent: f64 = self.fed_back.iter().map(combine).sum();
             tracking * tracked + fuel * spent
         };
-        if p > ENUMERATED_GENERATORS_MAX {
+        if p > ENUMERATED_GENERATORS_MAX || self.sign_products(p) > ENUMERATED_PRODUCTS_MAX {
             // Triangle inequality.
             let supremum = weigh(&|power| power.iter().map(|x| x.abs()).sum());
-            return Decrease { lambda_bar: 1.0 - supremum, exact: false };
+            return Ok(Decrease { lambda_bar: 1.0 - supremum, exact: false });
         }
         // w and -w weigh the same: the last sign is fixed.
-        let supremum = (0..1usize << (p - 1))
-            .map(|signs| {
-                weigh(&|power| {
-                    power
-                        .row_iter()
-                        .map(|row| {
-                            let signed = row
-                                .iter()
-                                .enumerate()
-                                .map(|(g, x)| if signs >> g & 1 == 1 { -x } else { *x });
-                            signed.sum::<f64>().abs()
-                        })
-                        .sum()
-                })
-            })
-            .fold(0.0, f64::max);
-        Decrease { lambda_bar: 1.0 - supremum, exact: true }
+        let mut supremum = 0.0;
+        for signs in 0..1usize << (p - 1) {
+            budget.check()?;
+            let weight = weigh(&|power| {
+                power
+                    .row_iter()
+                    .map(|row| {
+                        let signed = row
+                            .iter()
+                            .enumerate()
+                            .map(|(g, x)| if signs >> g & 1 == 1 { -x } else { *x });
+                        signed.sum::<f64>().abs()
+                    })
+                    .sum()
+            });
+            supremum = f64::max(supremum, weight);
+        }
+        Ok(Decrease { lambda_bar: 1.0 - supremum, exact: true })
+    }
+}
+
+impl Tube {
+    /// Products in the enumeration of all signs of p generators.
+    fn sign_products(&self, p: usize) -> usize {
+        let entries = |terms: &[DMatrix<f64>]| terms.iter().map(DMatrix::len).sum::<usize>();
+        (entries(&self.powers) + entries(&self.fed_back)).saturating_mul(1 << (p - 1))
     }
 }
 
@@ -227,13 +275,13 @@ mod tests {
         let gain = DMatrix::from_row_slice(1, 2, &[-0.06, -0.5]);
         let closed = DMatrix::from_row_slice(2, 2, &[1.0, 1.0, -0.06, 0.5]);
         let w = DMatrix::from_row_slice(2, 2, &[0.1, 0.0, 0.0, 0.4]);
-        Tube::new(&closed, &gain, &Zonotope::centred(w)).unwrap()
+        Tube::new(&closed, &gain, &Zonotope::centred(w), Budget::UNLIMITED).unwrap()
     }
 
     #[test]
     fn decrease_of_the_double_integrator_is_the_papers() {
         // Paper: 0.27; the independent implementation: 0.2671478.
-        let decrease = double_integrator().decrease(1.0, 0.02);
+        let decrease = double_integrator().decrease(1.0, 0.02, Budget::UNLIMITED).unwrap();
         assert!((decrease.lambda_bar - 0.2671478).abs() < 1e-7 && decrease.exact);
     }
 
@@ -250,10 +298,26 @@ mod tests {
     }
 
     #[test]
+    fn supremum_that_takes_too_long_is_bounded_instead() {
+        let tube = |pole: f64| {
+            let closed = DMatrix::identity(14, 14) * pole;
+            let gain = DMatrix::from_element(1, 14, 0.1);
+            let set = Zonotope::centred(DMatrix::identity(14, 14) * 1e-6);
+            let tube = Tube::new(&closed, &gain, &set, Budget::UNLIMITED).unwrap();
+            tube.decrease(1.0, 1.0, Budget::UNLIMITED).unwrap()
+        };
+        let (quick, slow) = (tube(1e-3), tube(0.99));
+        assert!(quick.exact && !slow.exact);
+        // 14 generators with |w|_1 = 1e-6 and |K w|_1 = 1e-7, and a geometric series.
+        assert!((1.0 - slow.lambda_bar - 1.1 * 14e-6 / 0.01).abs() < 1e-12);
+    }
+
+    #[test]
     fn unstable_loop_is_refused_even_without_disturbance() {
         let one = DMatrix::from_element(1, 1, 1.0);
         let none = Zonotope::centred(DMatrix::zeros(1, 0));
-        assert_eq!(Tube::new(&one, &one, &none), Err(TubeError));
-        assert_eq!(Tube::new(&(&one * 1.5), &one, &none), Err(TubeError));
+        let tube = |a: &DMatrix<f64>| Tube::new(a, &one, &none, Budget::UNLIMITED);
+        assert_eq!(tube(&one), Err(TubeError::NoContraction));
+        assert_eq!(tube(&(&one * 1.5)), Err(TubeError::NoContraction));
     }
 }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use nalgebra::{DMatrix, DVector};
 
 use super::Polytope;
+use crate::budget::{Budget, Interruption};
 
 /// A point closer than this to the hull, relative to the size of the points, does not extend it.
 const BEYOND: f64 = 1e-10;
@@ -18,6 +19,15 @@ pub enum HullError {
     /// More facets than allowed.
     #[error("more than {0} facets")]
     TooManyFacets(usize),
+    /// Stopped from outside.
+    #[error("stopped: {0:?}")]
+    Interrupted(Interruption),
+}
+
+impl From<Interruption> for HullError {
+    fn from(interruption: Interruption) -> Self {
+        Self::Interrupted(interruption)
+    }
 }
 
 /// The hull of some of the points it was given: those that extended it.
@@ -44,7 +54,11 @@ impl Hull {
     ///
     /// # Errors
     /// [`HullError`].
-    pub fn new(points: &[DVector<f64>], facets_max: usize) -> Result<Self, HullError> {
+    pub fn new(
+        points: &[DVector<f64>],
+        facets_max: usize,
+        budget: Budget<'_>,
+    ) -> Result<Self, HullError> {
         let simplex = first_simplex(points).ok_or(HullError::Flat)?;
         let n = points[0].len();
         let corners: Vec<DVector<f64>> = simplex.iter().map(|&i| points[i].clone()).collect();
@@ -56,6 +70,7 @@ impl Hull {
             hull.push_facet(corners);
         }
         for (i, point) in points.iter().enumerate() {
+            budget.check()?;
             if !simplex.contains(&i) {
                 hull.insert(point, facets_max)?;
             }
@@ -154,6 +169,7 @@ pub fn vertices(
     polytope: &Polytope,
     interior: &DVector<f64>,
     facets_max: usize,
+    budget: Budget<'_>,
 ) -> Result<Vec<DVector<f64>>, HullError> {
     let rooms = polytope.margins(interior);
     if !rooms.iter().all(|&room| room > 0.0) {
@@ -162,7 +178,7 @@ pub fn vertices(
     let polar: Vec<DVector<f64>> = (polytope.normals().row_iter().zip(rooms.iter()))
         .map(|(normal, room)| normal.transpose() / *room)
         .collect();
-    let hull = Hull::new(&polar, facets_max)?;
+    let hull = Hull::new(&polar, facets_max, budget)?;
     // Unbounded exactly if the polar points do not surround the origin.
     if !hull.facets.iter().all(|facet| facet.offset > BEYOND * hull.size) {
         return Err(HullError::Flat);
@@ -259,7 +275,7 @@ mod tests {
     #[test]
     fn hull_of_a_cube_is_the_cube() {
         for n in 2..=5 {
-            let hull = Hull::new(&cube(n), 10_000).unwrap();
+            let hull = Hull::new(&cube(n), 10_000, Budget::UNLIMITED).unwrap();
             assert_eq!(hull.corners().len(), 1 << n);
             // Every facet of the triangulated surface lies in a face of the cube.
             for facet in &hull.facets {
@@ -274,9 +290,9 @@ mod tests {
     #[test]
     fn vertices_of_a_cube_are_its_corners() {
         for n in 2..=4 {
-            let polytope = Hull::new(&cube(n), 10_000).unwrap().to_polytope();
+            let polytope = Hull::new(&cube(n), 10_000, Budget::UNLIMITED).unwrap().to_polytope();
             let interior = DVector::from_element(n, 0.1);
-            let found = vertices(&polytope, &interior, 10_000).unwrap();
+            let found = vertices(&polytope, &interior, 10_000, Budget::UNLIMITED).unwrap();
             for corner in &cube(n)[..1 << n] {
                 assert!(found.iter().any(|v| (v - corner).amax() < 1e-9), "{n}: {corner}");
             }
@@ -289,11 +305,14 @@ mod tests {
     #[test]
     fn flat_points_and_unbounded_polytopes_are_refused() {
         let flat = [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]].map(|p| DVector::from_column_slice(&p));
-        assert_eq!(Hull::new(&flat, 100), Err(HullError::Flat));
+        assert_eq!(Hull::new(&flat, 100, Budget::UNLIMITED), Err(HullError::Flat));
         let strip = Polytope::new(
             DMatrix::from_row_slice(3, 2, &[1.0, 0.0, -1.0, 0.0, 0.0, 1.0]),
             DVector::from_element(3, 1.0),
         );
-        assert_eq!(vertices(&strip, &DVector::zeros(2), 100), Err(HullError::Flat));
+        assert_eq!(
+            vertices(&strip, &DVector::zeros(2), 100, Budget::UNLIMITED),
+            Err(HullError::Flat)
+        );
     }
 }

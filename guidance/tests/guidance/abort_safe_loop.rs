@@ -40,7 +40,7 @@ fn singles() -> Vec<ThrustMode> {
 /// The full mission to the space station: approach ellipsoid, keep-out sphere, 20 m box, target.
 /// Orbit, regions and weights are the paper's; thresholds it does not give. [AguilarMarsillach2022,
 /// VI.A, VI.B, VI.D]
-fn station(safety_steps: usize) -> Problem {
+pub(crate) fn station(safety_steps: usize) -> Problem {
     let axis = Distance::from_metres(6_726_270.0);
     let passive = weights(1.0, 1.3e4, 1e2);
     let active = weights(1e3, 1.0, 1e3);
@@ -82,7 +82,7 @@ fn station(safety_steps: usize) -> Problem {
 }
 
 /// The eccentric orbit of the V-bar approach, first phase only. [AguilarMarsillach2022, VI.A2]
-fn eccentric(horizon: usize) -> Problem {
+pub(crate) fn eccentric(horizon: usize) -> Problem {
     let axis = Distance::from_metres(7_419_320.0);
     let mut problem = station(horizon);
     problem.orbit = KeplerOrbit::new(axis, 0.1, Angle::from_degrees(145.0), None).unwrap();

@@ -1,10 +1,16 @@
 //! Laws of abort safety: which modes matter, what membership means and what it does not.
 
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
+};
+
 use nalgebra::{DMatrix, DVector, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use vbar_guidance::{
     Budget, Interruption,
+    budget::Question,
     dynamics::{PeriodicPlant, RelativeVector},
     mission::{AvoidanceRegion, AvoidanceSet, ThrustMode, Thrusters, dominating_modes},
     orbit::KeplerOrbit,
@@ -126,11 +132,12 @@ fn few_modes_hold_the_states_that_all_hold() {
 #[test]
 fn making_sets_stops_when_told() {
     let (plant, avoid, forces) = (plant(1), cube(), thrusters().full_forces_n());
-    let asked = std::sync::atomic::AtomicUsize::new(0);
-    let stop = || {
-        let count = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+    let asked = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&asked);
+    let stop: Question = Arc::new(move || {
+        let count = counted.fetch_add(1, Ordering::Relaxed);
         (count >= 3).then_some(Interruption::Deadline)
-    };
+    });
     let modes = [ThrustMode::NONE.bits()];
     let question = PolytopeQuestion {
         plant: &plant,
@@ -141,7 +148,7 @@ fn making_sets_stops_when_told() {
     };
     let stopped = PolytopeUnion::new(&question, 0..4, Budget::new(&stop));
     assert_eq!(stopped, Err(Interruption::Deadline));
-    assert_eq!(asked.into_inner(), 4);
+    assert_eq!(asked.load(Ordering::Relaxed), 4);
 }
 
 #[test]
@@ -222,7 +229,7 @@ fn search_that_may_not_search_says_undecided() {
     let short = AbortQuestion { programs_max: 1, ..asked };
     let verdict = find_abort(&short, &counterexample(), Budget::UNLIMITED).unwrap();
     assert_eq!(verdict, AbortVerdict::Undecided { programs: 0 });
-    let stop = || Some(Interruption::Cancelled);
+    let stop: Question = Arc::new(|| Some(Interruption::Cancelled));
     let stopped = find_abort(&asked, &counterexample(), Budget::new(&stop));
     assert_eq!(stopped, Err(Interruption::Cancelled));
 }

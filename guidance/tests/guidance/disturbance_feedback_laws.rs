@@ -1,16 +1,23 @@
 //! What a plan with disturbance feedback promises: the paper's tables, flights that stay inside
 //! their sets, certificates that refuse what was altered, faults by field.
 
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
+};
+
 use nalgebra::{DMatrix, DVector, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use vbar_guidance::{
     Budget, Interruption,
+    budget::Question,
     control::{
         Claim, Controller, Failure, PrepareError, StepError,
         disturbance_feedback::{
             ArrivalMetric, DisturbanceFeedback, EFFORT_WEIGHT_DEFAULT, FUEL_WEIGHT_DEFAULT, Gain,
-            Instants, LinearModel, Measurement, Origin, Plan, Problem, State, Verdict, plan,
+            Instants, LinearModel, Measurement, Origin, Plan, Problem, State, Verdict, design,
+            plan,
         },
     },
     epoch::{Epoch, TimeSystem},
@@ -41,7 +48,7 @@ fn equal_time(count: usize, duration_s: f64) -> Instants {
 }
 
 /// [Deaconu2014, Table 1] with N = 10; noise of 0.02 m and 0.002 m/s as in its section IV.
-fn prisma(duration_s: f64) -> Problem {
+pub(crate) fn prisma(duration_s: f64) -> Problem {
     Problem {
         orbit: orbit(7_011_000.0, 0.004, 0.0),
         epoch: None,
@@ -61,7 +68,7 @@ fn prisma(duration_s: f64) -> Problem {
 }
 
 /// [Deaconu2014, Table 2], N = 10.
-fn simbol_x(duration_s: f64) -> Problem {
+pub(crate) fn simbol_x(duration_s: f64) -> Problem {
     Problem {
         orbit: orbit(106_246_975.0, 0.7988, 135.0),
         initial: relative([-305.0, 0.0, 396.0, 0.0, 0.0, 0.0]),
@@ -225,7 +232,7 @@ fn faults_are_named_by_field() {
 
 #[test]
 fn interrupted_plan_says_so() {
-    let cancelled = || Some(Interruption::Cancelled);
+    let cancelled: Question = Arc::new(|| Some(Interruption::Cancelled));
     let answer = plan(&prisma(9_000.0), Budget::new(&cancelled));
     let expected = Failure::Interrupted(Interruption::Cancelled);
     assert!(matches!(answer, Err(PrepareError::Failure(failure)) if failure == expected));
@@ -234,14 +241,22 @@ fn interrupted_plan_says_so() {
 #[test]
 fn deadline_in_the_conic_program_still_gives_a_certified_plan() {
     // The first questions are answered, the ones around the conic program are not.
-    let asked = std::sync::atomic::AtomicUsize::new(0);
-    let late = || {
-        let count = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+    let asked = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&asked);
+    let late: Question = Arc::new(move || {
+        let count = counted.fetch_add(1, Ordering::Relaxed);
         (count >= 2).then_some(Interruption::Deadline)
-    };
-    let plan = plan(&prisma(9_000.0), Budget::new(&late)).unwrap();
-    let certificate = &plan.outcome().certificate;
+    });
+    let designed = design(&prisma(9_000.0), Budget::new(&late)).unwrap();
+    let certificate = &designed.plan.outcome().certificate;
     assert!(certificate.passed && certificate.claim == Claim::Feasible, "{certificate:?}");
+    assert!(designed.is_cut_short);
+    assert!(!design(&prisma(9_000.0), Budget::UNLIMITED).unwrap().is_cut_short);
+    // The problem's artifact it is not.
+    asked.store(0, Ordering::Relaxed);
+    let shard = DisturbanceFeedback::run_shard(&prisma(9_000.0), 0, Budget::new(&late));
+    let expected = Failure::Interrupted(Interruption::Deadline);
+    assert!(matches!(shard, Err(PrepareError::Failure(failure)) if failure == expected));
 }
 
 // ---- Certificate ---------------------------------------------------------------------------
@@ -474,7 +489,10 @@ fn plan_bytes_come_back_and_every_flipped_bit_is_found() {
     assert_eq!(Problem::from_bytes(&problem.canonical_bytes()).as_ref(), Ok(&problem));
     let plan = planned(&problem);
     let bytes = plan.to_bytes();
-    assert_eq!(Plan::from_bytes(&bytes).as_ref(), Ok(&plan));
+    let read = Plan::from_bytes(&bytes).unwrap();
+    assert_eq!(read, plan);
+    // Comparison takes -0.0 for 0.0, people who look at both plans do not.
+    assert_eq!(format!("{:?}", read.gains()), format!("{:?}", plan.gains()));
     assert_eq!(planned(&problem).to_bytes(), bytes, "the same problem gives the same bytes");
     for bit in 0..8 * bytes.len() {
         let mut changed = bytes.clone();

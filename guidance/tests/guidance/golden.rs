@@ -386,7 +386,9 @@ fn check_torque_free(label: &str, case: &Value, artifact: &Artifact) {
         },
     };
     let rows = table.as_array().unwrap();
-    let samples = motion.samples(number(&physical["eta"]), number(&physical["dt_s"]), rows.len());
+    let samples = motion
+        .samples(number(&physical["eta"]), number(&physical["dt_s"]), rows.len(), Budget::UNLIMITED)
+        .unwrap();
     for (j, (sample, row)) in samples.iter().zip(rows).enumerate() {
         let position = sample.capture_point_m / scaling.position_unit_m;
         let velocity = sample.capture_velocity_m_s / scaling.velocity_unit_m_s;

@@ -297,7 +297,7 @@ fn check_terminal_cost(name: &str, case: &Value) -> usize {
     let (q, r, k) = (matrix(&case["Q"]), matrix(&case["R"]), matrix(&case["K"]));
     for (i, entry) in list(&case["cases"]).iter().enumerate() {
         let loops: Vec<DMatrix<f64>> = list(&entry["Acl"]).iter().map(matrix).collect();
-        let p = terminal_cost(&q, &r, &k, &loops).unwrap();
+        let p = terminal_cost(&q, &r, &k, &loops, Budget::UNLIMITED).unwrap();
         assert_matrix(&format!("{name} {i}"), &p, &entry["P"], number(&case["rtol"]));
     }
     list(&case["cases"]).len()
@@ -317,7 +317,7 @@ fn support(rows: &HalfSpaces, direction: &[f64]) -> f64 {
         rows: rows.rows(),
         offsets: rows.offsets(),
     };
-    let solution = Clarabel.solve_quadratic(&program);
+    let solution = Clarabel.solve_quadratic(&program, Budget::UNLIMITED).unwrap();
     assert_eq!(solution.status, Status::Optimal, "support in {direction:?}");
     solution.point.iter().zip(direction).map(|(x, d)| x * d).sum()
 }
@@ -541,7 +541,7 @@ impl Online {
         gradient[width] = 1.0;
         let program =
             QuadraticProgram { cost: &cost, gradient: &gradient, rows: &lifted, offsets: &offsets };
-        let solution = Clarabel.solve_quadratic(&program);
+        let solution = Clarabel.solve_quadratic(&program, Budget::UNLIMITED).unwrap();
         assert_eq!(solution.status, Status::Optimal);
         solution.point[width]
     }

@@ -1,11 +1,17 @@
 //! Laws of the closed loop on random missions, and what a certificate refuses.
 
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
+};
+
 use nalgebra::{DMatrix, DVector, Matrix6, Vector3, Vector6};
 use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use vbar_guidance::{
     Budget, Interruption,
+    budget::Question,
     control::{
         Claim, Controller, Failure, StepError,
         variable_horizon::{
@@ -26,7 +32,7 @@ use vbar_guidance::{
 /// A random rendezvous with a spinning target in low orbit, in the ranges of
 /// [Quartullo2025a, sec. V.A].
 #[derive(Debug, Clone)]
-struct Mission {
+pub(crate) struct Mission {
     acceleration_max: f64,
     spin_period_s: f64,
     distance_m: f64,
@@ -39,7 +45,7 @@ struct Mission {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum DisturbanceLaw {
+pub(crate) enum DisturbanceLaw {
     Uniform,
     Vertices,
     ConstantVertex,
@@ -86,7 +92,7 @@ fn missions() -> impl Strategy<Value = Mission> {
 }
 
 impl Mission {
-    fn problem(&self) -> Problem {
+    pub(crate) fn problem(&self) -> Problem {
         let rate = std::f64::consts::TAU / self.spin_period_s;
         let port = Vector3::new(-1.5, 0.0, 0.0);
         // [Quartullo2025b]: the capture point lies before the port, inside every tightened cone.
@@ -491,7 +497,7 @@ fn missed_steps_without_time_to_optimise_are_answered_by_the_tail() {
         let first = step(&mission, &artifact, &VariableHorizon::start(&artifact), &x);
         let plan = first.trajectory.as_ref().unwrap();
         let x = plan.states.row(4).transpose();
-        let no_time = || Some(Interruption::Deadline);
+        let no_time: Question = Arc::new(|| Some(Interruption::Deadline));
         let measured = at_step(&mission, 4, &x);
         let budget = Budget::new(&no_time);
         let answer = VariableHorizon::step(&artifact, &first.next, &measured, budget).unwrap();
@@ -570,7 +576,7 @@ fn artifact_with_navigation_errors_survives_its_bytes_and_flies() {
     panic!("no arrival");
 }
 
-fn example(scheme: Scheme, law: DisturbanceLaw) -> Mission {
+pub(crate) fn example(scheme: Scheme, law: DisturbanceLaw) -> Mission {
     Mission {
         acceleration_max: 0.02,
         spin_period_s: 500.0,
@@ -612,11 +618,11 @@ fn interrupted_step(
     questions: usize,
     kind: Interruption,
 ) -> Result<Step, StepError> {
-    let asked = std::sync::atomic::AtomicUsize::new(0);
-    let ask = || {
-        let before = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+    let asked = AtomicUsize::new(0);
+    let ask: Question = Arc::new(move || {
+        let before = asked.fetch_add(1, Ordering::Relaxed);
         (before >= questions).then_some(kind)
-    };
+    });
     VariableHorizon::step(artifact, state, &mission.measured(x), Budget::new(&ask))
 }
 

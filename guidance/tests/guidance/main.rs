@@ -21,5 +21,7 @@ mod orbital_motion;
 mod quadratic;
 mod redundancy;
 mod scenario;
+mod shards;
+mod sizes;
 mod two_body_truth;
 mod uncertainty;

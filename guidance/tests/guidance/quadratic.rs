@@ -1,11 +1,14 @@
 //! The dual active set against Clarabel and against the conditions of optimality, on random
 //! programs with every kind of trouble.
 
+use std::sync::Arc;
+
 use nalgebra::DMatrix;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use vbar_guidance::{
     Budget, Interruption,
+    budget::Question,
     program::{
         Clarabel, DenseRows, DualActiveSet, NotPositiveDefinite, QuadraticCost, QuadraticProgram,
         QuadraticSolution, Status, prove_infeasible, verify_quadratic,
@@ -112,7 +115,7 @@ fn solve(program: &QuadraticProgram<'_>, start: &[usize]) -> QuadraticSolution {
 /// The conditions hold, and an interior-point method finds the same optimum to its tolerance.
 fn check(label: &str, program: &QuadraticProgram<'_>, feasible: bool) {
     let solution = solve(program, &[]);
-    let general = Clarabel.solve_quadratic(program);
+    let general = Clarabel.solve_quadratic(program, Budget::UNLIMITED).unwrap();
     if !feasible {
         assert_eq!(solution.status, Status::PrimalInfeasible, "{label}");
         let proof = prove_infeasible(program.rows, program.offsets, &solution.active);
@@ -150,7 +153,7 @@ fn quadratic_agrees_with_clarabel_on_random_programs() {
         let random = Random::new(seed, trouble);
         let program = random.program();
         check(&format!("seed {seed} {trouble:?}"), &program, trouble != Trouble::Infeasible);
-        let general = Clarabel.solve_quadratic(&program);
+        let general = Clarabel.solve_quadratic(&program, Budget::UNLIMITED).unwrap();
         optimal_by_clarabel += usize::from(general.status == Status::Optimal);
     }
     // 350 of the 420 are feasible; the comparison must not be empty.
@@ -227,7 +230,7 @@ fn quadratic_verification_refuses_what_is_not_optimal() {
 #[test]
 fn quadratic_interruption_is_passed_on() {
     let random = Random::new(8, Trouble::None);
-    let ask = || Some(Interruption::Cancelled);
+    let ask: Question = Arc::new(|| Some(Interruption::Cancelled));
     let result = DualActiveSet::default().solve(&random.program(), &[], Budget::new(&ask));
     assert_eq!(result, Err(Interruption::Cancelled));
 }

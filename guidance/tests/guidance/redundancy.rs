@@ -1,10 +1,13 @@
 //! Redundant rows against their definition, by an interior-point method on every row.
 
+use std::sync::Arc;
+
 use nalgebra::DMatrix;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use vbar_guidance::{
     Budget, Interruption,
+    budget::Question,
     program::{Clarabel, DenseRows, QuadraticCost, QuadraticProgram, Status},
     reach::{EXACT, HalfSpaces, NoInterior, Reduction, irredundant},
 };
@@ -51,7 +54,7 @@ fn margin(all: &HalfSpaces, row: usize, others: &[usize]) -> f64 {
     let cost = QuadraticCost::new(DMatrix::identity(n, n) * 1e-9).unwrap();
     let program =
         QuadraticProgram { cost: &cost, gradient: &gradient, rows: &rows, offsets: &offsets };
-    let solution = Clarabel.solve_quadratic(&program);
+    let solution = Clarabel.solve_quadratic(&program, Budget::UNLIMITED).unwrap();
     assert_eq!(solution.status, Status::Optimal);
     let at: f64 = all.normal(row).iter().zip(&solution.point).map(|(a, x)| a * x).sum();
     at - all.offset(row)
@@ -166,7 +169,7 @@ fn redundancy_of_an_empty_set_is_a_proof() {
 
 #[test]
 fn redundancy_interrupted_says_so() {
-    let ask = || Some(Interruption::Deadline);
+    let ask: Question = Arc::new(|| Some(Interruption::Deadline));
     let rows = bundles(7, 3, 50);
     let result = irredundant(&rows, &HalfSpaces::new(3), EXACT, Budget::new(&ask));
     assert_eq!(result, Err(NoInterior::Interrupted(Interruption::Deadline)));

@@ -4,12 +4,12 @@ use std::ops::Range;
 
 use super::{Phase, Problem, Safety, Watch, faults::faults};
 use crate::{
-    budget::Budget,
+    budget::{Budget, Interruption},
     bytes::{DecodeError, Reader, Writer},
     control::{Failure, PrepareError},
     dynamics::PeriodicPlant,
     mission::{ThrustMode, dominating_modes},
-    reach::{EllipsoidUnion, PolytopeQuestion, PolytopeUnion},
+    reach::{EllipsoidUnion, PolytopeQuestion, PolytopeUnion, ReadError},
     sets::{CentredEllipsoid, Polytope, ZonotopeFacets},
 };
 
@@ -57,15 +57,51 @@ pub(super) enum PhaseSets {
 /// Sets of some starts of one phase.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shard {
+    /// Its place among all.
+    pub(super) index: usize,
     part: ShardPart,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 enum ShardPart {
     Nothing,
-    Ellipsoids(usize, EllipsoidUnion),
+    Ellipsoids(EllipsoidUnion),
     /// With the number of sets of all modes that were asked for, if counted.
-    Polytopes(usize, PolytopeUnion, Option<usize>),
+    Polytopes(PolytopeUnion, Option<usize>),
+}
+
+impl Shard {
+    pub(super) fn write(&self, writer: &mut Writer) {
+        match &self.part {
+            ShardPart::Nothing => {}
+            ShardPart::Ellipsoids(union) => union.write(writer),
+            ShardPart::Polytopes(union, sets) => {
+                union.write(writer);
+                writer.option(*sets, Writer::count);
+            }
+        }
+    }
+
+    pub(super) fn read(
+        problem: &Problem,
+        index: usize,
+        reader: &mut Reader<'_>,
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
+        let part = match extent(problem, index) {
+            None => ShardPart::Nothing,
+            Some((phase, starts)) => {
+                match read_sets(&problem.phases[phase], starts, reader, budget)? {
+                    PhaseSets::None => ShardPart::Nothing,
+                    PhaseSets::Ellipsoids { union, .. } => ShardPart::Ellipsoids(union),
+                    PhaseSets::Polytopes { union, sets_of_all_modes, .. } => {
+                        ShardPart::Polytopes(union, sets_of_all_modes)
+                    }
+                }
+            }
+        };
+        Ok(Self { index, part })
+    }
 }
 
 impl Artifact {
@@ -76,7 +112,7 @@ impl Artifact {
     pub fn prepare(problem: &Problem) -> Result<Self, PrepareError> {
         let shards = (0..shard_count(problem)).map(|i| run_shard(problem, i, Budget::UNLIMITED));
         let shards = shards.collect::<Result<Vec<_>, _>>()?;
-        merge(problem, shards)
+        merge(problem, shards, Budget::UNLIMITED)
     }
 
     /// The problem.
@@ -117,34 +153,54 @@ impl Artifact {
     /// # Errors
     /// [`DecodeError`] for anything else.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, DecodeError> {
+        Self::from_bytes_within(bytes, Budget::UNLIMITED).map_err(ReadError::uninterrupted)
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// [`ReadError`].
+    pub fn from_bytes_within(bytes: &[u8], budget: Budget<'_>) -> Result<Self, ReadError> {
         let mut reader = Reader::new(bytes);
         let problem = super::encoding::read_problem(&mut reader)?;
         if let Some(fault) = faults(&problem).first() {
-            return Err(reader.fault(format!("{}: {}", fault.field, fault.got)));
+            return Err(reader.fault(format!("{}: {}", fault.field, fault.got)).into());
         }
-        let starts = problem.steps_per_period;
-        let mut phases = Vec::new();
+        let mut sets = Vec::with_capacity(problem.phases.len());
         for phase in &problem.phases {
-            let plant = plant(&problem, phase);
-            let instants = |watch: &Watch| watch.horizon * watch.fractions + 1;
-            let sets = match (phase.safety.watch(), form(phase)) {
-                (Some(watch), Form::Ellipsoid(avoid, around)) => {
-                    let union = EllipsoidUnion::read(&mut reader, starts, instants(watch))?;
-                    PhaseSets::Ellipsoids { avoid, around, union }
-                }
-                (Some(watch), Form::Polytope(avoid, modes)) => {
-                    let count = instants(watch);
-                    let union = PolytopeUnion::read(&mut reader, starts, modes.len(), count)?;
-                    let sets_of_all_modes = reader.option(Reader::count)?;
-                    PhaseSets::Polytopes { avoid, modes, union, sets_of_all_modes }
-                }
-                _ => PhaseSets::None,
-            };
-            phases.push(PreparedPhase { plant, sets });
+            sets.push(read_sets(phase, 0..problem.steps_per_period, &mut reader, budget)?);
         }
         reader.end()?;
+        let phases = problem.phases.iter().zip(sets);
+        let phases = phases
+            .map(|(phase, sets)| Ok(PreparedPhase { plant: plant(&problem, phase, budget)?, sets }))
+            .collect::<Result<_, Interruption>>()?;
         Ok(Self { nominal: nominal(&problem), problem, phases })
     }
+}
+
+/// Reads the sets of some starts of a phase.
+fn read_sets(
+    phase: &Phase,
+    starts: Range<usize>,
+    reader: &mut Reader<'_>,
+    budget: Budget<'_>,
+) -> Result<PhaseSets, ReadError> {
+    let instants = |watch: &Watch| watch.horizon * watch.fractions + 1;
+    Ok(match (phase.safety.watch(), form(phase)) {
+        (Some(watch), Form::Ellipsoid(avoid, around)) => {
+            let union = EllipsoidUnion::read(reader, starts, instants(watch), budget)?;
+            PhaseSets::Ellipsoids { avoid, around, union }
+        }
+        (Some(watch), Form::Polytope(avoid, modes)) => {
+            let rows = avoid.offsets().len();
+            let instants = instants(watch);
+            let union = PolytopeUnion::read(reader, starts, rows, modes.len(), instants, budget)?;
+            let sets_of_all_modes = reader.option(Reader::count)?;
+            PhaseSets::Polytopes { avoid, modes, union, sets_of_all_modes }
+        }
+        _ => PhaseSets::None,
+    })
 }
 
 fn nominal(problem: &Problem) -> ZonotopeFacets {
@@ -169,10 +225,14 @@ fn form(phase: &Phase) -> Form {
     }
 }
 
-fn plant(problem: &Problem, phase: &Phase) -> PeriodicPlant {
+fn plant(
+    problem: &Problem,
+    phase: &Phase,
+    budget: Budget<'_>,
+) -> Result<PeriodicPlant, Interruption> {
     let fractions = phase.safety.watch().map_or(1, |watch| watch.fractions);
-    let steps = problem.steps_per_period;
-    PeriodicPlant::new(&problem.orbit, problem.mass, problem.sample_time, steps, fractions)
+    let counts = [problem.steps_per_period, fractions];
+    PeriodicPlant::within(&problem.orbit, problem.mass, problem.sample_time, counts, budget)
 }
 
 /// The phase and the starts of a shard; `None` beyond the last.
@@ -183,6 +243,27 @@ fn extent(problem: &Problem, shard: usize) -> Option<(usize, Range<usize>)> {
     let (phase, block) = (shard / blocks.max(1), shard % blocks.max(1));
     let first = block * STARTS_A_SHARD;
     watched.clone().nth(phase).map(|phase| (phase, first..(first + STARTS_A_SHARD).min(kp)))
+}
+
+/// The sets of all starts and instants, as if none were empty, and the condensed regulator.
+pub(super) fn memory_bytes(problem: &Problem) -> usize {
+    /// A symmetric matrix.
+    const ELLIPSOID: usize = 21;
+    /// While shards are joined there are two of each.
+    const COPIES: usize = 2;
+    let sets = problem.phases.iter().filter_map(|phase| {
+        let watch = phase.safety.watch()?;
+        let instants = watch.horizon.saturating_mul(watch.fractions);
+        let numbers = match form(phase) {
+            Form::None => 0,
+            Form::Ellipsoid(..) => ELLIPSOID,
+            Form::Polytope(avoid, modes) => avoid.offsets().len() * (6 + modes.len()),
+        };
+        Some(problem.steps_per_period.saturating_mul(instants).saturating_mul(numbers))
+    });
+    let sets = sets.fold(0_usize, usize::saturating_add).saturating_mul(COPIES);
+    let inputs = problem.prediction_horizon.saturating_mul(3);
+    inputs.saturating_mul(inputs).saturating_add(sets).saturating_mul(size_of::<f64>())
 }
 
 /// Blocks of starts of every phase that watches a set; at least 1.
@@ -203,17 +284,17 @@ pub(super) fn run_shard(
     if !found.is_empty() {
         return Err(PrepareError::Faults(found));
     }
-    let Some((index, starts)) = extent(problem, shard) else {
-        return Ok(Shard { part: ShardPart::Nothing });
+    let Some((phase, starts)) = extent(problem, shard) else {
+        return Ok(Shard { index: shard, part: ShardPart::Nothing });
     };
-    let phase = &problem.phases[index];
-    let plant = plant(problem, phase);
+    let phase = &problem.phases[phase];
+    let plant = plant(problem, phase, budget)?;
     let horizon = phase.safety.watch().map_or(0, |watch| watch.horizon);
     let part = match form(phase) {
         Form::None => ShardPart::Nothing,
         Form::Ellipsoid(avoid, _) => {
             let union = EllipsoidUnion::new(&plant, &avoid, horizon, starts, budget)?;
-            ShardPart::Ellipsoids(index, union)
+            ShardPart::Ellipsoids(union)
         }
         Form::Polytope(avoid, modes) => {
             let forces = problem.thrusters.full_forces_n();
@@ -235,13 +316,17 @@ pub(super) fn run_shard(
                 }
                 _ => None,
             };
-            ShardPart::Polytopes(index, union, count)
+            ShardPart::Polytopes(union, count)
         }
     };
-    Ok(Shard { part })
+    Ok(Shard { index: shard, part })
 }
 
-pub(super) fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, PrepareError> {
+pub(super) fn merge(
+    problem: &Problem,
+    shards: Vec<Shard>,
+    budget: Budget<'_>,
+) -> Result<Artifact, PrepareError> {
     let found = faults(problem);
     if !found.is_empty() {
         return Err(PrepareError::Faults(found));
@@ -252,13 +337,12 @@ pub(super) fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, P
     let mut polytopes: Vec<Vec<PolytopeUnion>> = vec![Vec::new(); count];
     let mut counts: Vec<Option<usize>> = vec![Some(0); count];
     for shard in shards {
+        let Some((phase, _)) = extent(problem, shard.index) else { continue };
         match shard.part {
             ShardPart::Nothing => {}
-            ShardPart::Ellipsoids(phase, union) => {
-                ellipsoids.get_mut(phase).ok_or_else(missing)?.push(union);
-            }
-            ShardPart::Polytopes(phase, union, sets) => {
-                polytopes.get_mut(phase).ok_or_else(missing)?.push(union);
+            ShardPart::Ellipsoids(union) => ellipsoids[phase].push(union),
+            ShardPart::Polytopes(union, sets) => {
+                polytopes[phase].push(union);
                 counts[phase] = counts[phase].zip(sets).map(|(sum, sets)| sum + sets);
             }
         }
@@ -271,7 +355,7 @@ pub(super) fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, P
             let sets = match form(phase) {
                 Form::None => PhaseSets::None,
                 Form::Ellipsoid(avoid, around) => {
-                    let union = EllipsoidUnion::joined(ellipsoids)
+                    let union = EllipsoidUnion::joined(ellipsoids, budget)?
                         .filter(|union| union.starts() == starts)
                         .ok_or_else(missing)?;
                     PhaseSets::Ellipsoids { avoid, around, union }
@@ -283,7 +367,7 @@ pub(super) fn merge(problem: &Problem, shards: Vec<Shard>) -> Result<Artifact, P
                     PhaseSets::Polytopes { avoid, modes, union, sets_of_all_modes }
                 }
             };
-            Ok(PreparedPhase { plant: plant(problem, phase), sets })
+            Ok(PreparedPhase { plant: plant(problem, phase, budget)?, sets })
         })
         .collect::<Result<_, PrepareError>>()?;
     Ok(Artifact { nominal: nominal(problem), problem: problem.clone(), phases })

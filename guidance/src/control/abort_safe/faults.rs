@@ -3,7 +3,7 @@
 use nalgebra::SMatrix;
 
 use super::{Phase, Problem, Safety, Separation};
-use crate::control::Fault;
+use crate::{control::Fault, dynamics::integration_steps};
 
 /// Most numbers that the sets of a phase may need: 512 MB.
 pub const NUMBERS_MAX: usize = 64_000_000;
@@ -15,6 +15,9 @@ pub const STEPS_MAX: usize = 10_000;
 pub const FRACTIONS_MAX: usize = 64;
 /// Most instants of a safety horizon: artifacts keep their indices in two bytes.
 pub const INSTANTS_MAX: usize = 60_000;
+/// Most steps of the integration of all plants, which takes about a microsecond each. Three phases
+/// with 64 parts a step need 12 million on an orbit of eccentricity 0.8, less on rounder ones.
+const INTEGRATION_MAX: f64 = 2e7;
 /// Most sets that a predicted state is kept out of.
 pub const NEAREST_MAX: usize = 16;
 /// Coefficients of a general ellipsoid.
@@ -67,6 +70,11 @@ pub(super) fn faults(problem: &Problem) -> Vec<Fault> {
     for (field, value) in limits {
         require(positive(value), text(field), "a positive number", value.to_string());
     }
+    let parts: usize =
+        problem.phases.iter().map(|p| p.safety.watch().map_or(1, |watch| watch.fractions)).sum();
+    let work = integration_steps(&problem.orbit, problem.sample_time) * (kp as f64) * parts as f64;
+    let expected = "an orbit and a step that are integrated in 20000000 steps, all parts together";
+    require(work <= INTEGRATION_MAX, text("sample_time_s"), expected, format!("{work} steps"));
     require(!problem.phases.is_empty(), text("phases"), "at least one phase", text("none"));
     for (i, phase) in problem.phases.iter().enumerate() {
         phase_faults(problem, i, phase, &mut require);

@@ -75,8 +75,11 @@ pub use safety::{SafetyQuestion, safety_report};
 pub use state::State;
 pub use summary::{PhaseSummary, Summary};
 
-use super::{Controller, PrepareError, StepError};
-use crate::budget::Budget;
+use super::{
+    Controller, Method, PrepareError, StepError,
+    shard::{self, Place},
+};
+use crate::{budget::Budget, reach::ReadError};
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
 pub const VERSION: &str = "1";
@@ -93,6 +96,10 @@ impl Controller for AbortSafe {
     type Measurement = Measurement;
     type Answer = Step;
 
+    fn memory_bytes(problem: &Problem) -> usize {
+        artifact::memory_bytes(problem)
+    }
+
     fn shards(problem: &Problem) -> usize {
         artifact::shard_count(problem)
     }
@@ -105,12 +112,26 @@ impl Controller for AbortSafe {
         artifact::run_shard(problem, shard, budget)
     }
 
+    fn shard_to_bytes(problem: &Problem, shard: &Shard) -> Vec<u8> {
+        place(problem).seal(shard.index, |writer| shard.write(writer))
+    }
+
+    fn shard_from_bytes(
+        problem: &Problem,
+        bytes: &[u8],
+        budget: Budget<'_>,
+    ) -> Result<Shard, ReadError> {
+        let place = place(problem);
+        place.open(bytes, budget, |index, reader| Shard::read(problem, index, reader, budget))
+    }
+
     fn merge(
         problem: &Problem,
         shards: Vec<Shard>,
-        _budget: Budget<'_>,
+        budget: Budget<'_>,
     ) -> Result<Artifact, PrepareError> {
-        artifact::merge(problem, shards)
+        shard::complete(shards.iter().map(|shard| shard.index), Self::shards(problem))?;
+        artifact::merge(problem, shards, budget)
     }
 
     fn start(_artifact: &Artifact) -> State {
@@ -124,5 +145,13 @@ impl Controller for AbortSafe {
         budget: Budget<'_>,
     ) -> Result<Step, StepError> {
         step::step(artifact, state, measurement, budget)
+    }
+}
+
+fn place(problem: &Problem) -> Place {
+    Place {
+        method: Method::AbortSafe,
+        problem: problem.canonical_bytes(),
+        shards: AbortSafe::shards(problem),
     }
 }

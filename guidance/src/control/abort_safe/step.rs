@@ -8,7 +8,7 @@ use super::{
     regulator::Regulator, safety::Judge,
 };
 use crate::{
-    budget::Budget,
+    budget::{Budget, Interruption},
     control::{
         Certificate, Claim, ConstraintFamily, ConstraintMargin, Failure, Fault, Infeasibility,
         ProofRow, Relaxation, StepError,
@@ -217,6 +217,12 @@ impl Here<'_> {
                 self.budget,
             )
         });
+        // A command that holds is not withheld because there was no time to say what could be done
+        // after it.
+        let safety = match safety.transpose() {
+            Err(Interruption::Deadline) => None,
+            judged => judged?,
+        };
         let flight = Flight::under(&self.prepared.plant, self.k, &self.x, &answer.inputs);
         let violation = answer.violations.iter().fold(0.0_f64, |a, &b| a.max(b));
         Ok(Step {
@@ -241,7 +247,7 @@ impl Here<'_> {
             }),
             certificate: Some(certificate),
             unsafe_state: self.unsafe_state,
-            safety: safety.transpose()?,
+            safety,
             diagnostics: Diagnostics {
                 cuts: cuts.cuts.len(),
                 least_clearance: cuts.least_clearance,

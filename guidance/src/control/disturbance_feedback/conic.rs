@@ -77,13 +77,17 @@ pub(super) fn solve(
     let burns = program.variables(rows);
     let magnitudes = program.variables(rows);
     let total = program.variables(1);
-    let mut shares: Vec<Share> = (0..model.burns()).map(|i| share(model, i, scarce)).collect();
+    let mut shares = Vec::with_capacity(model.burns());
+    for i in 0..model.burns() {
+        budget.check()?;
+        shares.push(share(model, i, scarce));
+    }
     for share in &mut shares {
         share.share = program.variables(1);
         share.first_answer = program.variables(share.scarce.len() * share.basis.ncols());
         share.first_norm = program.variables(share.scarce.len());
     }
-    let bound = model.lower_bound();
+    let bound = model.lower_bound(budget)?;
     let least: f64 = bound.trace_shares.iter().sum();
     let size = if least > 0.0 { least } else { 1.0 };
     let unit = bound.objective.max(f64::MIN_POSITIVE);
@@ -103,7 +107,9 @@ pub(super) fn solve(
     let solution = program.solve(budget)?;
     let solved = matches!(solution.status, Status::Optimal | Status::Inaccurate);
     let usable = !solution.x.is_empty() && solution.x.iter().all(|x| x.is_finite());
-    let draft = usable.then(|| interpreted(model, burns, &shares, &solution.x));
+    let patient = budget.beyond_deadline();
+    let draft = usable.then(|| interpreted(model, burns, &shares, &solution.x, patient));
+    let draft = draft.transpose()?;
     Ok(Relaxed { draft, solved, iterations: solution.iterations.max(1) })
 }
 
@@ -216,10 +222,17 @@ fn add_share(program: &mut ConeProgram, share: &Share, size: f64) {
 }
 
 /// Burns and scarce answers from the solver; the free rows answer the rest, each by its room.
-fn interpreted(model: &LinearModel, burns: usize, shares: &[Share], x: &[f64]) -> Draft {
+fn interpreted(
+    model: &LinearModel,
+    burns: usize,
+    shares: &[Share],
+    x: &[f64],
+    budget: Budget<'_>,
+) -> Result<Draft, Interruption> {
     let weight = |row: usize| (1.0 - x[burns + row].abs()).max(WEIGHT_LEAST);
     let mut gains = Vec::new();
     for (i, share) in shares.iter().enumerate() {
+        budget.check()?;
         let first = 3 * (i + 1);
         let (map, mut rest) = (model.answers(i), model.unanswered(i));
         let mut answer = DMatrix::zeros(map.ncols(), 6);
@@ -244,7 +257,7 @@ fn interpreted(model: &LinearModel, burns: usize, shares: &[Share], x: &[f64]) -
     gains.sort_by_key(|gain: &Gain| (gain.burn, gain.disturbance));
     let limit = model.limit;
     let burn = |k: usize| Vector3::from_fn(|axis, _| x[burns + 3 * k + axis] * limit);
-    Draft { burns: (0..model.burns()).map(burn).collect(), gains }
+    Ok(Draft { burns: (0..model.burns()).map(burn).collect(), gains })
 }
 
 /// L_ki = Y_ki P_i^-1 of all later burns from the stacked answers Y_i (3 (later burns) x 6).

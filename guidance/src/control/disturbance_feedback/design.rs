@@ -25,24 +25,36 @@ const GAP_OF_FAST_PATH: f64 = 1e-9;
 /// which the linear program for the burns takes out.
 const OVERDRAWN: f64 = 1e-7;
 
-/// Computes a plan; see [`super::plan`].
+/// A plan, and whether there was time for all of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Designed {
+    /// The plan, certified either way.
+    pub plan: Plan,
+    /// The deadline came before the search ended: with more time there would be a better plan, so
+    /// this is not what the problem's artifact is.
+    pub is_cut_short: bool,
+}
+
+/// Computes a plan, or the best there is when the deadline comes.
 ///
 /// # Errors
-/// [`PrepareError`].
-pub(super) fn design(problem: &Problem, budget: Budget<'_>) -> Result<Plan, PrepareError> {
+/// As [`super::plan`].
+pub fn design(problem: &Problem, budget: Budget<'_>) -> Result<Designed, PrepareError> {
     budget.check()?;
     let model = LinearModel::of(problem)?;
     reachable(problem, &model)?;
     budget.check()?;
     let quick = Origin { fast_path: true, conic_iterations: 0 };
-    if let Some(plan) = closed_form(&model).and_then(|draft| finished(problem, draft, quick))
+    let patient = budget.beyond_deadline();
+    if let Some(draft) = closed_form(&model, patient)?
+        && let Some(plan) = finished(problem, draft, quick, patient)?
         && plan.outcome().certificate.relative_gap <= GAP_OF_FAST_PATH
     {
-        return Ok(plan);
+        return Ok(Designed { plan, is_cut_short: false });
     }
     let mut search = ConicSearch { drafts: Vec::new(), iterations: 0 };
     let failed = match search.run(problem, &model, budget) {
-        Ok(plan) => return Ok(plan),
+        Ok(plan) => return Ok(Designed { plan, is_cut_short: false }),
         Err(Failure::Interrupted(Interruption::Cancelled)) => {
             return Err(Failure::Interrupted(Interruption::Cancelled).into());
         }
@@ -50,7 +62,9 @@ pub(super) fn design(problem: &Problem, budget: Budget<'_>) -> Result<Plan, Prep
     };
     // Out of time, or defeated by numbers: a plan that is certified but not proved best still
     // flies, and its certificate says how far from best it can be.
-    search.best_repaired(problem, &model).ok_or(failed.into())
+    let is_cut_short = matches!(failed, Failure::Interrupted(_));
+    let best = search.best_repaired(problem, &model, patient)?.ok_or(failed)?;
+    Ok(Designed { plan: best, is_cut_short })
 }
 
 /// The general way: ever more rows rationed until the answer respects every limit.
@@ -67,7 +81,8 @@ impl ConicSearch {
         model: &LinearModel,
         budget: Budget<'_>,
     ) -> Result<Plan, Failure> {
-        let gains = closed_form_gains(model, &vec![1.0; 3 * model.burns()]);
+        let patient = budget.beyond_deadline();
+        let gains = closed_form_gains(model, &vec![1.0; 3 * model.burns()], patient)?;
         let burns = cheapest_burns(model, &[]).unwrap_or_default();
         let mut scarce = vec![false; 3 * model.burns()];
         let first = Draft { burns, gains };
@@ -83,9 +98,12 @@ impl ConicSearch {
             let done = overdrawn.is_empty() && relaxed.solved;
             self.drafts.push(draft.clone());
             if done {
-                return weakened(model, &draft.gains)
-                    .and_then(|draft| finished(problem, draft, self.origin()))
-                    .ok_or_else(|| Failure::Numerical("a plan failed its certificate".into()));
+                let plan = match weakened(model, &draft.gains, patient)? {
+                    Some(draft) => finished(problem, draft, self.origin(), patient)?,
+                    None => None,
+                };
+                let failed = || Failure::Numerical("a plan failed its certificate".into());
+                return plan.ok_or_else(failed);
             }
         }
         Err(Failure::Numerical("the conic program was not solved".into()))
@@ -96,12 +114,21 @@ impl ConicSearch {
     }
 
     /// The cheapest plan that weaker gains of any draft give. Gains of 0 always give one.
-    fn best_repaired(&self, problem: &Problem, model: &LinearModel) -> Option<Plan> {
-        let plans = self
-            .drafts
-            .iter()
-            .filter_map(|draft| finished(problem, weakened(model, &draft.gains)?, self.origin()));
-        plans.min_by(|a, b| a.outcome().objective.total_cmp(&b.outcome().objective))
+    fn best_repaired(
+        &self,
+        problem: &Problem,
+        model: &LinearModel,
+        budget: Budget<'_>,
+    ) -> Result<Option<Plan>, Interruption> {
+        let mut plans = Vec::new();
+        for draft in &self.drafts {
+            if let Some(draft) = weakened(model, &draft.gains, budget)? {
+                plans.extend(finished(problem, draft, self.origin(), budget)?);
+            }
+        }
+        let by_objective =
+            |a: &Plan, b: &Plan| a.outcome().objective.total_cmp(&b.outcome().objective);
+        Ok(plans.into_iter().min_by(by_objective))
     }
 }
 
@@ -115,15 +142,20 @@ fn overdrawn_rows(model: &LinearModel, draft: &Draft) -> Vec<usize> {
 
 /// `gains` with the cheapest burns beside them, or the largest share of the gains for which there
 /// are any: a conic solver's gains may want a hair more than there is.
-fn weakened(model: &LinearModel, gains: &[Gain]) -> Option<Draft> {
+fn weakened(
+    model: &LinearModel,
+    gains: &[Gain],
+    budget: Budget<'_>,
+) -> Result<Option<Draft>, Interruption> {
     let scaled = |share: f64| -> Vec<Gain> {
         gains.iter().map(|gain| Gain { matrix: &gain.matrix * share, ..gain.clone() }).collect()
     };
     if let Some(burns) = cheapest_burns(model, gains) {
-        return Some(Draft { burns, gains: gains.to_vec() });
+        return Ok(Some(Draft { burns, gains: gains.to_vec() }));
     }
     let (mut low, mut high) = (0.0, 1.0);
     for _ in 0..30 {
+        budget.check()?;
         let middle = 0.5 * (low + high);
         if cheapest_burns(model, &scaled(middle)).is_some() {
             low = middle;
@@ -132,7 +164,7 @@ fn weakened(model: &LinearModel, gains: &[Gain]) -> Option<Draft> {
         }
     }
     let gains = scaled(low);
-    cheapest_burns(model, &gains).map(|burns| Draft { burns, gains })
+    Ok(cheapest_burns(model, &gains).map(|burns| Draft { burns, gains }))
 }
 
 /// Fails with a fault if no impulses reach the target state, or with the least limit if the
@@ -201,27 +233,32 @@ fn infeasibility(model: &LinearModel, least: f64, ray: &[f64]) -> Infeasibility 
 
 /// Gains in closed form and the cheapest burns beside them, if there are any: first the gains of
 /// least effort, then those that spare the burns which the nominal plan needs.
-fn closed_form(model: &LinearModel) -> Option<Draft> {
+fn closed_form(model: &LinearModel, budget: Budget<'_>) -> Result<Option<Draft>, Interruption> {
     let even = vec![1.0; 3 * model.burns()];
-    let first = closed_form_gains(model, &even);
+    let first = closed_form_gains(model, &even, budget)?;
     if let Some(burns) = cheapest_burns(model, &first) {
-        return Some(Draft { burns, gains: first });
+        return Ok(Some(Draft { burns, gains: first }));
     }
-    let nominal = cheapest_burns(model, &[])?;
+    budget.check()?;
+    let Some(nominal) = cheapest_burns(model, &[]) else { return Ok(None) };
     let spare: Vec<f64> = nominal
         .iter()
         .flat_map(|burn| burn.map(|v| (1.0 - v.abs() / model.limit).max(0.0)).data.0[0])
         .collect();
-    let gains = closed_form_gains(model, &spare);
-    let burns = cheapest_burns(model, &gains)?;
-    Some(Draft { burns, gains })
+    let gains = closed_form_gains(model, &spare, budget)?;
+    Ok(cheapest_burns(model, &gains).map(|burns| Draft { burns, gains }))
 }
 
 /// L_ki of all later burns k: the least (weighted) answer that leaves nothing of H G_i P_i within
 /// their range, -D (R_i D)^+ H G_i P_i with R_i the map of those burns and D the `weights`.
-fn closed_form_gains(model: &LinearModel, weights: &[f64]) -> Vec<Gain> {
+fn closed_form_gains(
+    model: &LinearModel,
+    weights: &[f64],
+    budget: Budget<'_>,
+) -> Result<Vec<Gain>, Interruption> {
     let mut gains = Vec::new();
     for i in 0..model.burns() {
+        budget.check()?;
         let mut answers = model.answers(i);
         let weights = &weights[3 * (i + 1)..];
         for (column, weight) in weights.iter().enumerate() {
@@ -232,7 +269,7 @@ fn closed_form_gains(model: &LinearModel, weights: &[f64]) -> Vec<Gain> {
         gains.extend(conic::gains_of(model, i, &answer));
     }
     gains.sort_by_key(|gain: &Gain| (gain.burn, gain.disturbance));
-    gains
+    Ok(gains)
 }
 
 /// The cheapest burns that leave room for the corrections of `gains`; `None` if there are none.
@@ -263,6 +300,16 @@ fn rooms(model: &LinearModel, gains: &[Gain]) -> Vec<f64> {
 }
 
 /// The plan, if it passes its certificate.
-fn finished(problem: &Problem, draft: Draft, origin: Origin) -> Option<Plan> {
-    Plan::from_burns_and_gains(problem.clone(), draft.burns, draft.gains, origin).ok()
+fn finished(
+    problem: &Problem,
+    draft: Draft,
+    origin: Origin,
+    budget: Budget<'_>,
+) -> Result<Option<Plan>, Interruption> {
+    let Draft { burns, gains } = draft;
+    match Plan::from_burns_and_gains_within(problem.clone(), burns, gains, origin, budget) {
+        Ok(plan) => Ok(Some(plan)),
+        Err(PrepareError::Failure(Failure::Interrupted(why))) => Err(why),
+        Err(_) => Ok(None),
+    }
 }

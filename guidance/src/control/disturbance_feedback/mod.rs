@@ -85,6 +85,7 @@ pub use answer::{
     Arrival, BurnCommand, Diagnostics, Measurement, RealisedDisturbance, Step, Verdict,
 };
 pub use coast::{Coast, CoastState};
+pub use design::{Designed, design};
 pub use model::{LinearModel, LowerBound};
 pub use outcome::{ArrivalSet, BurnBounds, Outcome, PlanCertificate, PlannedState};
 pub use plan::{Gain, Origin, Plan};
@@ -93,8 +94,11 @@ pub use problem::{
 };
 pub use state::State;
 
-use super::{Controller, PrepareError, StepError};
-use crate::budget::Budget;
+use super::{Controller, Method, PrepareError, StepError, shard::Place};
+use crate::{
+    budget::{Budget, Interruption},
+    reach::ReadError,
+};
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
 pub const VERSION: &str = "1";
@@ -111,6 +115,15 @@ impl Controller for DisturbanceFeedback {
     type Measurement = Measurement;
     type Answer = Step;
 
+    /// The conic program's gains of every burn for the noise of every earlier one, with what its
+    /// factorisation fills in.
+    fn memory_bytes(problem: &Problem) -> usize {
+        const FILLED: usize = 64;
+        let gains =
+            problem.instants.count().saturating_mul(problem.instants.count()).saturating_mul(18);
+        gains.saturating_mul(FILLED).saturating_mul(size_of::<f64>())
+    }
+
     /// One: a plan takes milliseconds.
     fn shards(_problem: &Problem) -> usize {
         1
@@ -121,7 +134,25 @@ impl Controller for DisturbanceFeedback {
         _shard: usize,
         budget: Budget<'_>,
     ) -> Result<Plan, PrepareError> {
-        plan(problem, budget)
+        let designed = design(problem, budget)?;
+        // Whenever it is made, the artifact of a problem is the same.
+        if designed.is_cut_short {
+            return Err(Interruption::Deadline.into());
+        }
+        Ok(designed.plan)
+    }
+
+    fn shard_to_bytes(problem: &Problem, shard: &Plan) -> Vec<u8> {
+        place(problem).seal(0, |writer| shard.write_found(writer))
+    }
+
+    fn shard_from_bytes(
+        problem: &Problem,
+        bytes: &[u8],
+        budget: Budget<'_>,
+    ) -> Result<Plan, ReadError> {
+        let place = place(problem);
+        place.open(bytes, budget, |_, reader| Plan::read_found(problem.clone(), reader, budget))
     }
 
     fn merge(
@@ -131,7 +162,7 @@ impl Controller for DisturbanceFeedback {
     ) -> Result<Plan, PrepareError> {
         match shards.into_iter().next() {
             Some(plan) => Ok(plan),
-            None => plan(problem, budget),
+            None => Self::run_shard(problem, 0, budget),
         }
     }
 
@@ -150,14 +181,18 @@ impl Controller for DisturbanceFeedback {
     }
 }
 
-/// Computes a plan.
+fn place(problem: &Problem) -> Place {
+    Place { method: Method::DisturbanceFeedback, problem: problem.canonical_bytes(), shards: 1 }
+}
+
+/// Computes a plan: when the deadline comes, the best that was found, if it passes its certificate.
 ///
 /// # Errors
 /// [`PrepareError::Faults`] by field, among them instants from which no impulse reaches the target
 /// state (half a revolution apart); [`PrepareError::Infeasible`] with the least `delta_v_max_m_s`
 /// if the limit is too low; [`PrepareError::Failure`] when interrupted or defeated by numbers.
 pub fn plan(problem: &Problem, budget: Budget<'_>) -> Result<Plan, PrepareError> {
-    design::design(problem, budget)
+    design(problem, budget).map(|designed| designed.plan)
 }
 
 /// Least `delta_v_max_m_s` for which a plan exists (gains of zero cost no margin, so this is a

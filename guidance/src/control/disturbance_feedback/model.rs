@@ -4,6 +4,7 @@ use nalgebra::{DMatrix, DVector, Vector3};
 
 use super::{ArrivalMetric, Instants, Problem, outcome::physical_values};
 use crate::{
+    budget::{Budget, Interruption},
     control::{Failure, PrepareError},
     dynamics::{TschaunerHempel, yamanaka_ankersen},
     frames::{InFrame, LvlhCcsds, RelativeState},
@@ -218,18 +219,23 @@ impl LinearModel {
     /// A lower bound on the objective of every plan: no gains leave less of disturbance i than the
     /// part of H G_i P_i outside the range of the later burns, and no burns cost less than the linear
     /// program without corrections.
-    #[must_use]
-    pub fn lower_bound(&self) -> LowerBound {
-        let trace_shares: Vec<f64> = (0..self.burns())
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn lower_bound(&self, budget: Budget<'_>) -> Result<LowerBound, Interruption> {
+        let trace_shares = (0..self.burns())
             .map(|i| {
+                budget.check()?;
                 let effect = self.unanswered(i);
                 let within = range(&self.answers(i), 1e-12);
                 let answered = product(&within, &transposed_product(&within, &effect));
-                frobenius(&(effect - answered))
+                Ok(frobenius(&(effect - answered)))
             })
-            .collect();
+            .collect::<Result<Vec<f64>, Interruption>>()?;
         let sum: f64 = trace_shares.iter().sum();
-        LowerBound { objective: sum * sum + self.fuel_weight * self.least_fuel(), trace_shares }
+        budget.check()?;
+        let objective = sum * sum + self.fuel_weight * self.least_fuel();
+        Ok(LowerBound { objective, trace_shares })
     }
 
     /// A lower bound on the fuel, m/s: from the multipliers of the linear program, whoever found

@@ -7,6 +7,7 @@ use super::{
     model::{LinearModel, LowerBound},
 };
 use crate::{
+    budget::{Budget, Interruption},
     control::{Claim, Fault},
     frames::{LvlhCcsds, RelativeState},
     matrices::{frobenius, product, solve_lower, symmetric_eigenvalues},
@@ -131,15 +132,19 @@ impl Outcome {
         model: &LinearModel,
         burns: &[Vector3<f64>],
         gains: &[Gain],
-    ) -> Self {
+        budget: Budget<'_>,
+    ) -> Result<Self, Interruption> {
         let nominal = nominal_states(model, burns);
-        let (states, effects) = planned_states(model, &nominal, gains);
+        let (states, effects) = planned_states(model, &nominal, gains, budget)?;
         let in_metric: Effects = effects.iter().map(|e| product(&model.metric, e)).collect();
         let trace_shares: Vec<f64> = in_metric.iter().map(frobenius).collect();
         let sum: f64 = trace_shares.iter().sum();
         let fuel_m_s = burns.iter().flat_map(|burn| burn.iter()).map(|v| v.abs()).sum();
         let bounds = burn_bounds(model, burns, gains);
         let effort_m_s = bounds.iter().flat_map(|b| b.correction_max_m_s.data.0[0]).sum();
+        budget.check()?;
+        let matrix_inequality_margin = matrix_inequality_margin(&in_metric);
+        budget.check()?;
         let mut outcome = Self {
             arrival: arrival_set(model, &effects, &trace_shares),
             open_loop_arrival: problem.compare_open_loop.then(|| open_loop_set(model)),
@@ -158,13 +163,13 @@ impl Outcome {
                 objective_lower_bound: 0.0,
                 relative_gap: 0.0,
                 claim: Claim::Feasible,
-                matrix_inequality_margin: matrix_inequality_margin(&in_metric),
+                matrix_inequality_margin,
             },
             burns: bounds,
             states,
         };
-        outcome.judge(&model.lower_bound(), model.limit);
-        outcome
+        outcome.judge(&model.lower_bound(budget)?, model.limit);
+        Ok(outcome)
     }
 
     fn judge(&mut self, bound: &LowerBound, limit: f64) {
@@ -235,10 +240,12 @@ fn planned_states(
     model: &LinearModel,
     nominal: &[DVector<f64>],
     gains: &[Gain],
-) -> (Vec<PlannedState>, Effects) {
+    budget: Budget<'_>,
+) -> Result<(Vec<PlannedState>, Effects), Interruption> {
     let mut effects = Effects::new();
     let mut states = Vec::with_capacity(nominal.len());
     for (k, state) in nominal.iter().enumerate() {
+        budget.check()?;
         let scaled = outer_shape(model, k, &effects, true);
         states.push(PlannedState {
             elapsed: model.elapsed[k],
@@ -250,7 +257,7 @@ fn planned_states(
             effects = advanced_effects(model, k, &effects, gains);
         }
     }
-    (states, effects)
+    Ok((states, effects))
 }
 
 fn advanced_effects(model: &LinearModel, k: usize, effects: &Effects, gains: &[Gain]) -> Effects {

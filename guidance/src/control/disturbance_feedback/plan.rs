@@ -8,8 +8,10 @@ use super::{
     outcome::{gain_count, physical_values},
 };
 use crate::{
-    bytes::{DecodeError, Reader, Writer, crc32},
-    control::Fault,
+    budget::Budget,
+    bytes::{DecodeError, Reader, Writer},
+    control::{Fault, PrepareError, unread},
+    reach::ReadError,
 };
 
 /// First bytes of a plan of this method, with the version of the layout.
@@ -114,27 +116,55 @@ impl Plan {
     pub fn from_burns_and_gains(
         problem: Problem,
         burns: Vec<Vector3<f64>>,
-        mut gains: Vec<Gain>,
+        gains: Vec<Gain>,
         origin: Origin,
     ) -> Result<Self, Vec<Fault>> {
+        let budget = Budget::UNLIMITED;
+        Self::from_burns_and_gains_within(problem, burns, gains, origin, budget).map_err(|error| {
+            match error {
+                PrepareError::Faults(faults) => faults,
+                other => unreachable!("a plan is right, or has faults: {other:?}"),
+            }
+        })
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// [`PrepareError::Faults`] as there; [`PrepareError::Failure`] when interrupted.
+    pub fn from_burns_and_gains_within(
+        problem: Problem,
+        mut burns: Vec<Vector3<f64>>,
+        mut gains: Vec<Gain>,
+        origin: Origin,
+        budget: Budget<'_>,
+    ) -> Result<Self, PrepareError> {
         let of_problem =
             |fault: Fault| Fault { field: format!("problem.{}", fault.field), ..fault };
         let faults = problem.faults();
         if !faults.is_empty() {
-            return Err(faults.into_iter().map(of_problem).collect());
+            return Err(PrepareError::Faults(faults.into_iter().map(of_problem).collect()));
         }
         let faults = size_faults(problem.instants.count() - 1, &burns, &gains);
         if !faults.is_empty() {
-            return Err(faults);
+            return Err(PrepareError::Faults(faults));
         }
+        budget.check()?;
         let model = LinearModel::new(&problem).map_err(|rounding| {
-            vec![Fault::new("problem.navigation_errors", "sets that survive scaling", rounding)]
+            let expected = "sets that survive scaling";
+            let fault = Fault::new("problem.navigation_errors", expected, rounding);
+            PrepareError::Faults(vec![fault])
         })?;
         gains.sort_by_key(|gain| (gain.burn, gain.disturbance));
-        let outcome = Outcome::new(&problem, &model, &burns, &gains);
+        // The bytes know one zero: a plan that was just made is shown as one that was kept.
+        let entries = gains.iter_mut().flat_map(|gain| gain.matrix.iter_mut());
+        for x in entries.chain(burns.iter_mut().flatten()) {
+            *x += 0.0;
+        }
+        let outcome = Outcome::new(&problem, &model, &burns, &gains, budget)?;
         let plan = Self { problem, model, burns, gains, origin, outcome };
         let faults = plan.outcome.certificate.faults(plan.model.limit);
-        if faults.is_empty() { Ok(plan) } else { Err(faults) }
+        if faults.is_empty() { Ok(plan) } else { Err(PrepareError::Faults(faults)) }
     }
 
     /// Where `claimed` disagrees with what follows from burns and gains, by field of the plan's
@@ -157,16 +187,18 @@ impl Plan {
         let mut writer = Writer::default();
         writer.bytes(MAGIC);
         encoding::write_problem(&mut writer, &self.problem);
+        self.write_found(&mut writer);
+        writer.seal()
+    }
+
+    /// What was found for the problem: all that is not recomputed from it.
+    pub(super) fn write_found(&self, writer: &mut Writer) {
         self.burns.iter().for_each(|burn| writer.vector3(burn));
         for gain in &self.gains {
             gain.matrix.iter().for_each(|&x| writer.number(x));
         }
         writer.tag(u8::from(self.origin.fast_path));
         writer.count(self.origin.conic_iterations);
-        let mut bytes = writer.finish();
-        let checksum = crc32(&bytes);
-        bytes.extend(checksum.to_le_bytes());
-        bytes
     }
 
     /// Reads and checks again what [`Plan::to_bytes`] wrote.
@@ -175,17 +207,30 @@ impl Plan {
     /// [`DecodeError`] for bytes that are not a plan, and for a plan that does not pass its
     /// certificate.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, DecodeError> {
-        let fault = |offset: usize, what: &str| DecodeError { offset, what: what.into() };
-        let end = bytes.len().saturating_sub(4);
-        let (body, checksum) = bytes.split_at(end);
-        if checksum != crc32(body).to_le_bytes() {
-            return Err(fault(end, "the checksum differs: the bytes were changed on the way"));
-        }
-        let mut reader = Reader::new(body);
+        Self::from_bytes_within(bytes, Budget::UNLIMITED).map_err(ReadError::uninterrupted)
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// [`ReadError`].
+    pub fn from_bytes_within(bytes: &[u8], budget: Budget<'_>) -> Result<Self, ReadError> {
+        let mut reader = Reader::unsealed(bytes, || budget.check().map_err(ReadError::from))?;
         if reader.bytes()? != MAGIC {
-            return Err(reader.fault("not a disturbance-feedback plan of this layout"));
+            return Err(reader.fault("not a disturbance-feedback plan of this layout").into());
         }
         let problem = encoding::read_problem(&mut reader)?;
+        let plan = Self::read_found(problem, &mut reader, budget)?;
+        reader.end()?;
+        Ok(plan)
+    }
+
+    /// Reads and checks again what [`Plan::write_found`] wrote.
+    pub(super) fn read_found(
+        problem: Problem,
+        reader: &mut Reader<'_>,
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
         let count = problem.instants.count() - 1;
         let burns = (0..count).map(|_| reader.vector3()).collect::<Result<Vec<_>, _>>()?;
         let mut gains = Vec::with_capacity(gain_count(count));
@@ -198,15 +243,11 @@ impl Plan {
         let fast_path = match reader.tag()? {
             0 => false,
             1 => true,
-            other => return Err(reader.fault(format!("origin {other} is not known"))),
+            other => return Err(reader.fault(format!("origin {other} is not known")).into()),
         };
         let origin = Origin { fast_path, conic_iterations: reader.count()? };
-        reader.end()?;
-        Self::from_burns_and_gains(problem, burns, gains, origin).map_err(|faults| {
-            let first =
-                faults.first().map(|f| format!("{}: {}, got {}", f.field, f.expected, f.got));
-            reader.fault(first.unwrap_or_default())
-        })
+        Self::from_burns_and_gains_within(problem, burns, gains, origin, budget)
+            .map_err(|error| unread(error, reader))
     }
 }
 

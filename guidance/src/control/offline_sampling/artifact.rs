@@ -4,13 +4,17 @@ use nalgebra::{DMatrix, DVector};
 
 use super::{Problem, Scheme, encoding};
 use crate::{
+    budget::{Budget, Interruption},
     bytes::{DecodeError, Reader, Writer},
     dynamics::PlantMatrices,
     matrices::times_vector,
     program::{DenseRows, QuadraticCost},
-    reach::{HalfSpaces, StageGroup},
+    reach::{HalfSpaces, ReadError, StageGroup},
     sampling::ScalarLaw,
 };
+
+/// Rows between two looks at the budget.
+const BUDGET_PERIOD: usize = 1024;
 
 /// The controller, ready to fly.
 ///
@@ -138,9 +142,37 @@ impl Summary {
     }
 }
 
+/// The rows' parts over x and over the decisions.
+fn split_rows(parts: &Parts, budget: Budget<'_>) -> Result<(DenseRows, DenseRows), Interruption> {
+    let rows = &parts.rows;
+    let n = parts.problem.dimensions().0.min(rows.dimension());
+    let (mut over_x, mut over_d) = (DenseRows::new(n), DenseRows::new(rows.dimension() - n));
+    for row in 0..rows.len() {
+        if row % BUDGET_PERIOD == 0 {
+            budget.check()?;
+        }
+        let (x, d) = rows.normal(row).split_at(n);
+        over_x.push(x);
+        over_d.push(d);
+    }
+    Ok((over_x, over_d))
+}
+
 impl Artifact {
     /// Puts the parts together; says what does not fit.
-    pub(super) fn assemble(parts: Parts) -> Result<Self, String> {
+    pub(super) fn assemble(
+        parts: Parts,
+        budget: Budget<'_>,
+    ) -> Result<Result<Self, String>, Interruption> {
+        let (state_rows, decision_rows) = split_rows(&parts, budget)?;
+        Ok(Self::fitting(parts, state_rows, decision_rows))
+    }
+
+    fn fitting(
+        parts: Parts,
+        state_rows: DenseRows,
+        decision_rows: DenseRows,
+    ) -> Result<Self, String> {
         let Parts { problem, summary, cost, rows, origins, terminal_set, first_step_set } = &parts;
         let (n, m) = problem.dimensions();
         let decisions = problem.decisions();
@@ -157,12 +189,6 @@ impl Artifact {
         }
         let quadratic = QuadraticCost::new(cost.view((n, n), (decisions, decisions)) * 2.0)
             .map_err(|error| error.to_string())?;
-        let (mut state_rows, mut decision_rows) = (DenseRows::new(n), DenseRows::new(decisions));
-        for row in 0..rows.len() {
-            let (x, d) = rows.normal(row).split_at(n);
-            state_rows.push(x);
-            decision_rows.push(d);
-        }
         let mean = problem.plant.at_mean();
         let expected = problem.disturbance.iter().map(ScalarLaw::mean);
         let drift = DVector::from_iterator(problem.disturbance.len(), expected);
@@ -282,8 +308,24 @@ impl Artifact {
     #[must_use]
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut writer = Writer::default();
-        encoding::write_parts(&mut writer, &self.parts);
+        encoding::write_problem(&mut writer, &self.parts.problem);
+        self.write_found(&mut writer);
         writer.finish()
+    }
+
+    /// Appends what was found for the problem.
+    pub(super) fn write_found(&self, writer: &mut Writer) {
+        encoding::write_found(writer, &self.parts);
+    }
+
+    /// Reads what [`Artifact::write_found`] wrote, and checks that its parts fit.
+    pub(super) fn read_found(
+        problem: Problem,
+        reader: &mut Reader<'_>,
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
+        let parts = encoding::read_found(problem, reader, budget)?;
+        Self::assemble(parts, budget)?.map_err(|text| reader.fault(text).into())
     }
 
     /// Reads what [`Artifact::to_bytes`] wrote, and checks that its parts fit.
@@ -291,12 +333,21 @@ impl Artifact {
     /// # Errors
     /// [`DecodeError`] for anything else.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, DecodeError> {
+        Self::from_bytes_within(bytes, Budget::UNLIMITED).map_err(ReadError::uninterrupted)
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// [`ReadError`].
+    pub fn from_bytes_within(bytes: &[u8], budget: Budget<'_>) -> Result<Self, ReadError> {
         let mut reader = Reader::new(bytes);
-        let parts = encoding::read_parts(&mut reader)?;
-        reader.end()?;
-        if let Some(fault) = parts.problem.faults().first() {
-            return Err(reader.fault(format!("{}: {}", fault.field, fault.got)));
+        let problem = encoding::read_problem(&mut reader)?;
+        if let Some(fault) = problem.faults().first() {
+            return Err(reader.fault(format!("{}: {}", fault.field, fault.got)).into());
         }
-        Self::assemble(parts).map_err(|text| reader.fault(text))
+        let artifact = Self::read_found(problem, &mut reader, budget)?;
+        reader.end()?;
+        Ok(artifact)
     }
 }

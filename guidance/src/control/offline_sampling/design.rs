@@ -6,10 +6,11 @@ use super::{
     Artifact, GainChoice, GroupSummary, Problem, Scheme, Summary, artifact::Parts, terminal,
 };
 use crate::{
-    budget::Budget,
+    budget::{Budget, Interruption},
     control::{Failure, Fault, Infeasibility, PrepareError},
     dynamics::{
-        PlantMatrices, StageWeights, linear_quadratic_regulator, spectral_radius, terminal_cost,
+        PlantMatrices, StageWeights, TerminalCostError, linear_quadratic_regulator,
+        spectral_radius, terminal_cost,
     },
     matrices::product,
     reach::{HalfSpaces, NoInterior, PlantVertex, StageConstraints, StageGroup},
@@ -64,7 +65,7 @@ impl Design {
         let limits = problem.terminal_limits;
         let found = terminal::terminal_set(&state, &input, &gain, &closed, limits, budget)?;
         Ok(Self {
-            weights: weights(problem, &gain)?,
+            weights: weights(problem, &gain, budget)?,
             constraints: StageConstraints { state, input, terminal: found.set },
             terminal_iterations: found.iterations,
             groups: problem.groups(),
@@ -99,8 +100,8 @@ impl Design {
 }
 
 /// An artifact, or ours is the fault.
-pub(super) fn assembled(parts: Parts) -> Result<Artifact, PrepareError> {
-    Artifact::assemble(parts).map_err(|text| Failure::Numerical(text).into())
+pub(super) fn assembled(parts: Parts, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
+    Artifact::assemble(parts, budget)?.map_err(|text| Failure::Numerical(text).into())
 }
 
 /// K of a problem without faults.
@@ -186,18 +187,31 @@ fn plant_vertices<'a>(
 
 /// Q, R, and P with equality in [Mammarella2019, eq. 3]: over samples of the plant, or for the
 /// expected plant where nothing is sampled.
-fn weights(problem: &Problem, gain: &DMatrix<f64>) -> Result<StageWeights, PrepareError> {
+fn weights(
+    problem: &Problem,
+    gain: &DMatrix<f64>,
+    budget: Budget<'_>,
+) -> Result<StageWeights, PrepareError> {
     let closed_loop = |step: PlantMatrices| step.a + product(&step.b, gain);
     let sampled = |sample: usize| {
         let mut stream = Stream::new(problem.seed, TERMINAL_STREAM, sample as u64);
         closed_loop(problem.plant.draw(&mut stream))
     };
     let loops: Vec<DMatrix<f64>> = match problem.scheme {
-        Scheme::OfflineSampling => (0..problem.weights.samples).map(sampled).collect(),
+        Scheme::OfflineSampling => {
+            let samples = (0..problem.weights.samples).map(|sample| {
+                budget.check()?;
+                Ok(sampled(sample))
+            });
+            samples.collect::<Result<_, Interruption>>()?
+        }
         Scheme::LinearQuadratic | Scheme::TubeRobust => vec![closed_loop(problem.plant.at_mean())],
     };
     let (state, input) = (problem.weights.state.clone(), problem.weights.input.clone());
-    let terminal = terminal_cost(&state, &input, gain, &loops).map_err(|error| {
+    let terminal = terminal_cost(&state, &input, gain, &loops, budget).map_err(|error| {
+        if let TerminalCostError::Interrupted(why) = error {
+            return why.into();
+        }
         let expected = "a gain that is stable in the mean square";
         PrepareError::Faults(vec![Fault::new("gain", expected, error.to_string())])
     })?;

@@ -5,9 +5,10 @@ use super::{
     SampleChoice, Scheme, Summary, TubeSummary, artifact::Parts,
 };
 use crate::{
+    budget::Budget,
     bytes::{DecodeError, Reader, Writer},
     dynamics::{Discretisation, MatrixPolynomial, Monomial, PlantMatrices, UncertainPlant},
-    reach::{GrowthLimits, HalfSpaces, InvariantLimits, StageFamily, StageGroup},
+    reach::{GrowthLimits, HalfSpaces, InvariantLimits, ReadError, StageFamily, StageGroup},
     sampling::ScalarLaw,
     sets::Polytope,
 };
@@ -164,11 +165,11 @@ pub(super) fn read_problem(reader: &mut Reader<'_>) -> Result<Problem, DecodeErr
     })
 }
 
-pub(super) fn write_parts(writer: &mut Writer, parts: &Parts) {
-    write_problem(writer, &parts.problem);
+/// What was found for the problem.
+pub(super) fn write_found(writer: &mut Writer, parts: &Parts) {
     write_summary(writer, &parts.summary);
     writer.matrix(&parts.cost);
-    write_half_spaces(writer, &parts.rows);
+    parts.rows.write(writer);
     for origin in &parts.origins {
         match *origin {
             RowOrigin::FirstStep => writer.tag(4),
@@ -176,23 +177,30 @@ pub(super) fn write_parts(writer: &mut Writer, parts: &Parts) {
             RowOrigin::Stage(group) => write_group(writer, group),
         }
     }
-    write_half_spaces(writer, &parts.terminal_set);
-    writer.option(parts.first_step_set.as_ref(), write_half_spaces);
+    parts.terminal_set.write(writer);
+    writer.option(parts.first_step_set.as_ref(), |writer, set| set.write(writer));
 }
 
-pub(super) fn read_parts(reader: &mut Reader<'_>) -> Result<Parts, DecodeError> {
-    let problem = read_problem(reader)?;
+pub(super) fn read_found(
+    problem: Problem,
+    reader: &mut Reader<'_>,
+    budget: Budget<'_>,
+) -> Result<Parts, ReadError> {
     let summary = read_summary(reader)?;
     let cost = reader.matrix()?;
-    let rows = read_half_spaces(reader)?;
+    let rows = HalfSpaces::read(reader, budget)?;
     let origin = |reader: &mut Reader<'_>| match reader.tag()? {
         4 => Ok(RowOrigin::FirstStep),
         5 => Ok(RowOrigin::Tube),
         family => read_group(reader, family).map(RowOrigin::Stage),
     };
+    budget.check()?;
     let origins = (0..rows.len()).map(|_| origin(reader)).collect::<Result<_, _>>()?;
-    let terminal_set = read_half_spaces(reader)?;
-    let first_step_set = reader.option(read_half_spaces)?;
+    let terminal_set = HalfSpaces::read(reader, budget)?;
+    let first_step_set = match reader.option(|_| Ok(()))? {
+        Some(()) => Some(HalfSpaces::read(reader, budget)?),
+        None => None,
+    };
     Ok(Parts { problem, summary, cost, rows, origins, terminal_set, first_step_set })
 }
 
@@ -259,28 +267,6 @@ fn read_summary(reader: &mut Reader<'_>) -> Result<Summary, DecodeError> {
             })
         })?,
     })
-}
-
-fn write_half_spaces(writer: &mut Writer, rows: &HalfSpaces) {
-    writer.count(rows.dimension());
-    writer.numbers(rows.offsets());
-    for row in 0..rows.len() {
-        rows.normal(row).iter().for_each(|&entry| writer.number(entry));
-    }
-}
-
-fn read_half_spaces(reader: &mut Reader<'_>) -> Result<HalfSpaces, DecodeError> {
-    let dimension = reader.count()?;
-    if dimension > 100_000 {
-        return Err(reader.fault("too many coordinates"));
-    }
-    let offsets = reader.numbers()?;
-    let mut rows = HalfSpaces::new(dimension);
-    for offset in offsets {
-        let normal: Vec<f64> = (0..dimension).map(|_| reader.number()).collect::<Result<_, _>>()?;
-        rows.push(&normal, offset);
-    }
-    Ok(rows)
 }
 
 fn write_group(writer: &mut Writer, group: StageGroup) {

@@ -66,8 +66,12 @@ pub use sampled::Shard;
 pub use state::State;
 pub use step::{Branch, Command, Diagnostics, Measurement, Step, Verdict};
 
-use super::{Controller, Failure, PrepareError, StepError};
-use crate::budget::Budget;
+use super::{
+    Controller, Method, PrepareError, StepError,
+    shard::{self, Place},
+};
+use crate::{budget::Budget, reach::ReadError};
+use sampled::ShardPart;
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
 pub const VERSION: &str = "1";
@@ -97,6 +101,10 @@ impl Controller for OfflineSampling {
     type Measurement = Measurement;
     type Answer = Step;
 
+    fn memory_bytes(problem: &Problem) -> usize {
+        problem.memory_bytes()
+    }
+
     /// One a part of a sampled group, and one for the expected cost; one for a baseline.
     fn shards(problem: &Problem) -> usize {
         match problem.scheme {
@@ -110,12 +118,26 @@ impl Controller for OfflineSampling {
         shard: usize,
         budget: Budget<'_>,
     ) -> Result<Shard, PrepareError> {
-        let whole = |artifact| Shard::Whole(Box::new(artifact));
-        match problem.scheme {
+        let whole = |artifact| ShardPart::Whole(Box::new(artifact));
+        let part = match problem.scheme {
             Scheme::OfflineSampling => sampled::run_shard(problem, shard, budget),
             Scheme::LinearQuadratic => nominal::prepare(problem, budget).map(whole),
             Scheme::TubeRobust => tube::prepare(problem, budget).map(whole),
-        }
+        };
+        part.map(|part| Shard { index: shard, part })
+    }
+
+    fn shard_to_bytes(problem: &Problem, shard: &Shard) -> Vec<u8> {
+        place(problem).seal(shard.index, |writer| shard.write(writer))
+    }
+
+    fn shard_from_bytes(
+        problem: &Problem,
+        bytes: &[u8],
+        budget: Budget<'_>,
+    ) -> Result<Shard, ReadError> {
+        let place = place(problem);
+        place.open(bytes, budget, |index, reader| Shard::read(problem, index, reader, budget))
     }
 
     fn merge(
@@ -123,15 +145,8 @@ impl Controller for OfflineSampling {
         shards: Vec<Shard>,
         budget: Budget<'_>,
     ) -> Result<Artifact, PrepareError> {
-        let whole = shards.iter().find_map(|shard| match shard {
-            Shard::Whole(artifact) => Some(artifact.as_ref().clone()),
-            _ => None,
-        });
-        match (problem.scheme, whole) {
-            (Scheme::OfflineSampling, _) => sampled::merge(problem, &shards, budget),
-            (_, Some(artifact)) => Ok(artifact),
-            (_, None) => Err(Failure::Numerical("shards are missing".into()).into()),
-        }
+        shard::complete(shards.iter().map(|shard| shard.index), Self::shards(problem))?;
+        sampled::merge(problem, shards, budget)
     }
 
     fn start(_artifact: &Artifact) -> State {
@@ -145,5 +160,13 @@ impl Controller for OfflineSampling {
         budget: Budget<'_>,
     ) -> Result<Step, StepError> {
         step::step(artifact, state, measurement, budget)
+    }
+}
+
+fn place(problem: &Problem) -> Place {
+    Place {
+        method: Method::OfflineSampling,
+        problem: problem.canonical_bytes(),
+        shards: OfflineSampling::shards(problem),
     }
 }

@@ -28,7 +28,7 @@ pub(super) fn prepare(problem: &Problem, budget: Budget<'_>) -> Result<Artifact,
     let mut summary = design.summary(summaries(&design.groups, &groups, &kept));
     summary.doubtful_rows = reduction.doubtful;
     summary.outer_excess = reduction.outer_excess;
-    assembled(Parts {
+    let parts = Parts {
         problem: problem.clone(),
         summary,
         cost,
@@ -36,7 +36,8 @@ pub(super) fn prepare(problem: &Problem, budget: Budget<'_>) -> Result<Artifact,
         origins: kept.into_iter().map(RowOrigin::Stage).collect(),
         terminal_set: design.constraints.terminal,
         first_step_set: None,
-    })
+    };
+    assembled(parts, budget)
 }
 
 /// What is predicted where nothing is sampled.

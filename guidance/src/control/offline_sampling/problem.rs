@@ -2,6 +2,7 @@
 
 use nalgebra::DMatrix;
 
+use super::sampled::TERMINAL_PARTS;
 use crate::{
     control::Fault,
     dynamics::{Discretisation, PlantMatrices, UncertainPlant},
@@ -190,6 +191,40 @@ impl Problem {
             StageFamily::Terminal => terminal_rows,
         };
         self.groups().iter().map(rows).sum()
+    }
+
+    /// The sampled rows with their state and decisions: those of one part while it is sifted, what is
+    /// left of all, and the expected cost. How many terminal rows there are shows only when they are
+    /// made: here stands a rule of thumb, and no more than may be drawn at all.
+    pub(super) fn memory_bytes(&self) -> usize {
+        /// Of the part that is reduced: as sampled, in two orders, with the context, and three times
+        /// in coordinates that make the set round.
+        const PART_COPIES: usize = 6;
+        /// What a row has beside its entries, as numbers.
+        const BESIDE: usize = 6;
+        let (n, m) = self.dimensions();
+        let columns = self.horizon.saturating_mul(m).saturating_add(2 * n + 1);
+        let (state, input) = (self.state_set.offsets().len(), self.input_set.offsets().len());
+        // How many faces the terminal set has is known once it is found: as a rule up to n times
+        // those of the constraints.
+        let terminal = (state + input).saturating_mul(n).min(self.terminal_limits.rows_max);
+        let (mut all, mut largest) = (0_usize, 0);
+        if self.scheme == Scheme::OfflineSampling {
+            for (group, size) in self.groups().iter().zip(self.sizes()) {
+                let (faces, parts) = match group.family {
+                    StageFamily::State => (state, 1),
+                    StageFamily::Input => (input, 1),
+                    StageFamily::Terminal => (terminal, TERMINAL_PARTS),
+                };
+                let rows = size.saturating_mul(faces).min(self.samples.rows_max);
+                all = all.saturating_add(rows);
+                largest = largest.max(rows.div_ceil(parts));
+            }
+        }
+        // All of them stand for what is left of every part and the copies of that.
+        let rows = largest.saturating_mul(PART_COPIES).saturating_add(all);
+        let numbers = rows.saturating_mul(columns.saturating_add(BESIDE));
+        numbers.saturating_add(columns.saturating_mul(columns)).saturating_mul(size_of::<f64>())
     }
 
     /// Everything that can be seen to be wrong before computing.

@@ -1,17 +1,19 @@
 //! The offline part of the method itself, in shards: sampled rows, expected cost, first-step set.
 
 use super::{
-    Artifact, GroupSummary, Problem, Redundancy, RowOrigin, Summary,
+    Artifact, GroupSummary, Problem, Redundancy, RowOrigin, Scheme, Summary,
     artifact::Parts,
     design::{Design, assembled, no_set},
 };
 use crate::{
     budget::Budget,
+    bytes::{Reader, Writer},
     control::{Failure, Fault, PrepareError},
     dynamics::ExpectedCost,
     reach::{
-        EXACT, GroupPart, Growth, GrowthError, GrowthLimits, HalfSpaces, SampledRows, Scenario,
-        StageFamily, StageGroup, Survivors, grow_control_invariant, irredundant, step_back,
+        EXACT, GroupPart, Growth, GrowthError, GrowthLimits, HalfSpaces, ReadError, SampledRows,
+        Scenario, StageFamily, StageGroup, Survivors, grow_control_invariant, irredundant,
+        step_back,
     },
     sampling::failure_of_any,
 };
@@ -21,13 +23,63 @@ const COST_STREAM: u64 = u64::MAX;
 
 /// Part of an artifact.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Shard {
+pub struct Shard {
+    /// Its place among all.
+    pub(super) index: usize,
+    pub(super) part: ShardPart,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum ShardPart {
     /// The rows of one part of a group that are needed beside the context.
     Rows(Survivors),
     /// The expected cost.
     Cost(ExpectedCost),
     /// Everything: the baselines take milliseconds.
     Whole(Box<Artifact>),
+}
+
+impl Shard {
+    /// The rows that are left of its part of a group, if it has one.
+    #[must_use]
+    pub fn survivors(&self) -> Option<&Survivors> {
+        match &self.part {
+            ShardPart::Rows(rows) => Some(rows),
+            ShardPart::Cost(_) | ShardPart::Whole(_) => None,
+        }
+    }
+
+    pub(super) fn write(&self, writer: &mut Writer) {
+        match &self.part {
+            ShardPart::Rows(rows) => rows.write(writer),
+            ShardPart::Cost(cost) => cost.write(writer),
+            ShardPart::Whole(artifact) => artifact.write_found(writer),
+        }
+    }
+
+    pub(super) fn read(
+        problem: &Problem,
+        index: usize,
+        reader: &mut Reader<'_>,
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
+        let (n, m) = problem.dimensions();
+        let width = n + problem.horizon * m;
+        let part = match (problem.scheme, parts(problem).get(index)) {
+            (Scheme::LinearQuadratic | Scheme::TubeRobust, _) => {
+                let whole = Artifact::read_found(problem.clone(), reader, budget)?;
+                ShardPart::Whole(Box::new(whole))
+            }
+            (Scheme::OfflineSampling, Some(part)) => {
+                ShardPart::Rows(Survivors::read(reader, part.group, width, budget)?)
+            }
+            (Scheme::OfflineSampling, None) => {
+                let samples = problem.weights.samples;
+                ShardPart::Cost(ExpectedCost::read(reader, width + 1, samples)?)
+            }
+        };
+        Ok(Self { index, part })
+    }
 }
 
 /// A design with what is sampled.
@@ -83,7 +135,7 @@ const CHECK_TOLERANCE: f64 = 1e-7;
 
 /// A terminal set has more faces than the others, and its rows have all variables: it is cut up,
 /// so that no shard is much longer than the rest.
-const TERMINAL_PARTS: usize = 6;
+pub(super) const TERMINAL_PARTS: usize = 6;
 
 /// What each shard but the last reduces: the long ones first.
 fn parts(problem: &Problem) -> Vec<GroupPart> {
@@ -120,37 +172,37 @@ pub(super) fn run_shard(
     problem: &Problem,
     shard: usize,
     budget: Budget<'_>,
-) -> Result<Shard, PrepareError> {
+) -> Result<ShardPart, PrepareError> {
     let sampling = Sampling::new(problem, budget.untold())?;
     let scenario = sampling.scenario();
     let Some(&part) = parts(problem).get(shard) else {
-        return sampling.cost(budget).map(Shard::Cost);
+        return sampling.cost(budget).map(ShardPart::Cost);
     };
     let context = scenario.context(budget.untold()).map_err(|reason| no_set(&reason))?;
     let (tolerance, _) = tolerances(problem.redundancy);
     let rows = scenario.survivors(part, &context, tolerance, budget);
-    rows.map(Shard::Rows).map_err(|reason| no_set(&reason))
+    rows.map(ShardPart::Rows).map_err(|reason| no_set(&reason))
 }
 
 pub(super) fn merge(
     problem: &Problem,
-    shards: &[Shard],
+    shards: Vec<Shard>,
     budget: Budget<'_>,
 ) -> Result<Artifact, PrepareError> {
-    let sampling = Sampling::new(problem, budget.untold())?;
-    let scenario = sampling.scenario();
     let mut survivors = Vec::new();
     let mut cost = None;
     for shard in shards {
-        match shard {
-            Shard::Rows(rows) => survivors.push(rows.clone()),
-            Shard::Cost(part) => cost = Some(part.mean()),
-            Shard::Whole(_) => {}
+        match shard.part {
+            ShardPart::Rows(rows) => survivors.push(rows),
+            ShardPart::Cost(part) => cost = Some(part.mean()),
+            ShardPart::Whole(artifact) => return Ok(*artifact),
         }
     }
-    let (Some(cost), true) = (cost, survivors.len() == parts(problem).len()) else {
-        return Err(Failure::Numerical("shards are missing".into()).into());
+    let Some(cost) = cost else {
+        return Err(Failure::Numerical("no shard has the expected cost".into()).into());
     };
+    let sampling = Sampling::new(problem, budget.untold())?;
+    let scenario = sampling.scenario();
     let context = scenario.context(budget.untold()).map_err(|reason| no_set(&reason))?;
     let (_, tolerance) = tolerances(problem.redundancy);
     let merged = Scenario::merged(&context, &survivors, tolerance, budget)
@@ -185,7 +237,7 @@ pub(super) fn merge(
     if let Some(limits) = problem.first_step {
         add_first_step(&mut parts, &sampling.design, limits, budget)?;
     }
-    assembled(parts)
+    assembled(parts, budget)
 }
 
 /// What became of every group.
@@ -217,7 +269,7 @@ fn add_first_step(
     let width = parts.rows.dimension();
     let mut rows = HalfSpaces::new(width);
     let mut normal = vec![0.0; width];
-    let successors = step_back(&set, &vertices);
+    let successors = step_back(&set, &vertices, budget)?;
     for row in 0..successors.len() {
         let known = successors.normal(row);
         normal[..known.len()].copy_from_slice(known);

@@ -4,7 +4,7 @@ use nalgebra::DVector;
 
 use super::{Artifact, RowOrigin, Scheme, State, conflict::conflict};
 use crate::{
-    budget::Budget,
+    budget::{Budget, Interruption},
     control::{
         Certificate, Claim, ConstraintFamily, ConstraintMargin, Failure, Fault, Infeasibility,
         StepError,
@@ -120,7 +120,15 @@ pub(super) fn step(
         rows: artifact.decision_rows(),
         offsets: &offsets,
     };
-    let (solution, general) = solve(&program, &state.active, budget)?;
+    let (solution, general) = match solve(&program, &state.active, budget) {
+        Ok(solved) => solved,
+        Err(StepError::Failure(Failure::Interrupted(Interruption::Deadline)))
+            if present.tail.is_some() =>
+        {
+            return present.out_of_time(&program);
+        }
+        Err(error) => return Err(error),
+    };
     let diagnostics = Diagnostics {
         branch: Branch::None,
         expected_cost: None,
@@ -226,7 +234,7 @@ impl<'a> Present<'a> {
         State { step: self.step + 1, tail, nominal, active }
     }
 
-    /// Flies the previous plan's tail, clipped into the input set, and says so.
+    /// No corrections satisfy the rows: the previous plan's tail, if there is one.
     fn fall_back(
         &self,
         program: &QuadraticProgram<'_>,
@@ -234,30 +242,68 @@ impl<'a> Present<'a> {
         diagnostics: Diagnostics,
         budget: Budget<'_>,
     ) -> Result<Step, StepError> {
-        let artifact = self.artifact;
-        let conflict = conflict(artifact, program, &solution.active, budget)?;
-        let mut diagnostics = Diagnostics { conflict: Some(conflict.clone()), ..diagnostics };
-        let Some(tail) = &self.tail else {
-            return Ok(Step {
+        let conflict = conflict(self.artifact, program, &solution.active, budget)?;
+        let diagnostics = Diagnostics { conflict: Some(conflict.clone()), ..diagnostics };
+        match &self.tail {
+            Some(tail) => self.fly_tail(tail, program, diagnostics),
+            None => Ok(Step {
                 index: self.step,
                 verdict: Verdict::Infeasible(conflict),
                 next: State::START,
                 certificate: None,
                 diagnostics,
-            });
+            }),
+        }
+    }
+
+    /// The time was over before the program was solved: the previous plan's tail is still an
+    /// answer, and says that it is no more than that.
+    fn out_of_time(&self, program: &QuadraticProgram<'_>) -> Result<Step, StepError> {
+        let diagnostics = Diagnostics {
+            branch: Branch::None,
+            expected_cost: None,
+            iterations: 0,
+            scans: 0,
+            general_solver: false,
+            missed_steps: self.missed,
+            conflict: None,
         };
+        match &self.tail {
+            Some(tail) => self.fly_tail(tail, program, diagnostics),
+            None => Err(Failure::Interrupted(Interruption::Deadline).into()),
+        }
+    }
+
+    /// Flies the previous plan's tail, clipped into the input set, and says so.
+    fn fly_tail(
+        &self,
+        tail: &[f64],
+        program: &QuadraticProgram<'_>,
+        diagnostics: Diagnostics,
+    ) -> Result<Step, StepError> {
+        let artifact = self.artifact;
         let wanted = input(artifact, self.x, tail);
         let input = nearest_input(artifact, &wanted)?;
         let clipped = (&input - &wanted).amax() > 0.0;
-        let mut decisions = tail.clone();
+        let mut decisions = tail.to_vec();
         for (v, (u, w)) in decisions.iter_mut().zip(input.iter().zip(wanted.iter())) {
             *v += u - w;
         }
-        let flown =
-            QuadraticSolution { point: decisions.clone(), active: Vec::new(), ..solution.clone() };
+        let flown = QuadraticSolution {
+            status: Status::BudgetExhausted,
+            point: decisions.clone(),
+            // Nothing looks at it: a tail claims no optimum.
+            objective: f64::NAN,
+            active: Vec::new(),
+            iterations: 0,
+            scans: 0,
+        };
         let certificate = certify(artifact, program, &flown, self.x, Claim::PreviousPlanTail);
-        diagnostics.branch = Branch::PreviousPlanTail;
-        diagnostics.expected_cost = Some(certificate.cost);
+        let diagnostics = Diagnostics {
+            branch: Branch::PreviousPlanTail,
+            expected_cost: Some(certificate.cost),
+            ..diagnostics
+        };
         let command = Command { input, ..self.command(&decisions, clipped) };
         Ok(Step {
             index: self.step,
@@ -316,8 +362,7 @@ fn solve(
         Status::Optimal | Status::PrimalInfeasible => return Ok((solution, false)),
         _ => {}
     }
-    let general = Clarabel.solve_quadratic(program);
-    budget.check()?;
+    let general = Clarabel.solve_quadratic(program, budget)?;
     match general.status {
         Status::Optimal => Ok((general, true)),
         Status::PrimalInfeasible

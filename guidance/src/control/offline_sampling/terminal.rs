@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::design::infeasible;
 use crate::{
-    budget::Budget,
+    budget::{Budget, Interruption},
     control::{ConstraintFamily, Fault, Infeasibility, PrepareError, Relaxation},
     matrices::product,
     reach::{HalfSpaces, Invariant, InvariantLimits, PlantVertex, max_robust_positive_invariant},
@@ -85,7 +85,7 @@ fn least_offsets(
     limits: InvariantLimits,
     budget: Budget<'_>,
 ) -> Result<Option<Vec<f64>>, PrepareError> {
-    let taken = taken_by_disturbance(rows, closed);
+    let taken = taken_by_disturbance(rows, closed, budget)?;
     if !taken.iter().any(|&t| t > 0.0) {
         return Ok(None);
     }
@@ -124,7 +124,11 @@ fn least_offsets(
 
 /// Support of the sum of all images of the disturbance, for every row, under the mean of the
 /// vertices: less room than this leaves no invariant set.
-fn taken_by_disturbance(rows: &HalfSpaces, closed: &[PlantVertex<'_>]) -> Vec<f64> {
+fn taken_by_disturbance(
+    rows: &HalfSpaces,
+    closed: &[PlantVertex<'_>],
+    budget: Budget<'_>,
+) -> Result<Vec<f64>, Interruption> {
     let n = rows.dimension();
     let mut mean = DMatrix::zeros(n, n);
     closed.iter().for_each(|vertex| mean += &vertex.a);
@@ -134,6 +138,7 @@ fn taken_by_disturbance(rows: &HalfSpaces, closed: &[PlantVertex<'_>]) -> Vec<f6
         let mut direction = DVector::from_column_slice(rows.normal(row));
         let mut sum = 0.0;
         for _ in 0..SERIES_TERMS_MAX {
+            budget.check()?;
             let support =
                 |vertex: &PlantVertex<'_>| vertex.disturbance.support_function(&direction);
             let term = closed.iter().map(support).fold(0.0, f64::max);
@@ -143,7 +148,7 @@ fn taken_by_disturbance(rows: &HalfSpaces, closed: &[PlantVertex<'_>]) -> Vec<f6
             }
             direction = crate::matrices::times_vector(&back, &direction);
         }
-        sum
+        Ok(sum)
     };
     (0..rows.len()).map(support).collect()
 }

@@ -24,7 +24,7 @@ use crate::{
     dynamics::PlantMatrices,
     matrices::{product, times_vector},
     reach::{
-        EXACT, HalfSpaces, Invariant, PlantVertex, StageGroup, Tube, irredundant,
+        EXACT, HalfSpaces, Invariant, PlantVertex, StageGroup, Tube, TubeError, irredundant,
         max_robust_positive_invariant,
     },
     sampling::ScalarLaw,
@@ -71,7 +71,7 @@ pub(super) fn prepare(problem: &Problem, budget: Budget<'_>) -> Result<Artifact,
     summary.doubtful_rows = reduction.doubtful;
     summary.outer_excess = reduction.outer_excess;
     summary.tube = Some(tube.summary);
-    assembled(Parts {
+    let parts = Parts {
         problem: problem.clone(),
         summary,
         cost: with_place(&nominal.cost(&design.weights), n),
@@ -79,7 +79,8 @@ pub(super) fn prepare(problem: &Problem, budget: Budget<'_>) -> Result<Artifact,
         origins: reduction.kept.iter().map(origin).collect(),
         terminal_set: design.constraints.terminal,
         first_step_set: None,
-    })
+    };
+    assembled(parts, budget)
 }
 
 /// S over (z_0, v, 1) as a cost over (x, v, e, 1), with z_0 = x - e.
@@ -118,7 +119,10 @@ impl InvariantTube {
         let mean = problem.plant.at_mean();
         let lumped = lumped_disturbance(problem, &mean, &vertices(problem)?, budget)?;
         let closed = &mean.a + product(&mean.b, gain);
-        let series = Tube::new(&closed, gain, &lumped).map_err(|error| {
+        let series = Tube::new(&closed, gain, &lumped, budget).map_err(|error| {
+            if let TubeError::Interrupted(why) = error {
+                return why.into();
+            }
             let fault = Fault::new("gain", "a gain that stabilises the plant", error.to_string());
             PrepareError::Faults(vec![fault])
         })?;
@@ -268,7 +272,11 @@ fn corners(
         crate::reach::NoInterior::Interrupted(why) => why.into(),
         _ => infeasible(format!("{field} has no interior")),
     })?;
-    sets::vertices(set, &DVector::from_vec(inside.point), CORNERS_MAX).map_err(|error| {
+    let inside = DVector::from_vec(inside.point);
+    sets::vertices(set, &inside, CORNERS_MAX, budget).map_err(|error| {
+        if let sets::HullError::Interrupted(why) = error {
+            return why.into();
+        }
         let expected = "a bounded set, which bounds what an uncertain plant does";
         PrepareError::Faults(vec![Fault::new(field, expected, error.to_string())])
     })

@@ -7,8 +7,9 @@ use super::{
     encoding,
 };
 use crate::{
+    budget::{Budget, Interruption},
     bytes::{DecodeError, Reader, Writer},
-    control::{Fault, PrepareError},
+    control::{Fault, PrepareError, unread},
     dynamics::{
         GainError, HillScaling, clohessy_wiltshire, linear_quadratic_regulator, place_poles,
         spectral_radius,
@@ -16,13 +17,30 @@ use crate::{
     matrices::product,
     mission::ConeFaces,
     program::PlantTables,
-    reach::{Decrease, Tube},
+    reach::{Decrease, ReadError, Tube, TubeError},
     sets::{Polytope, Zonotope, ZonotopeMeasure},
     units::Seconds,
 };
 
 /// First bytes of an artifact of this method, with the version of the layout.
 const MAGIC: &[u8; 8] = b"vbarVH\x00\x01";
+
+/// Sizes beyond which no problem is prepared, nor read back: everything that is made of a problem,
+/// on reading too, then takes a second or two at most. Far above the published missions (horizon
+/// 122, 6 states, 12 generators).
+const SIZES_MAX: Sizes =
+    Sizes { states: 32, inputs: 32, generators: 96, rows: 256, horizon: 2_000, steps: 100_000 };
+
+/// What the work on a problem grows with.
+struct Sizes {
+    states: usize,
+    inputs: usize,
+    generators: usize,
+    /// Of each polytope.
+    rows: usize,
+    horizon: usize,
+    steps: usize,
+}
 
 /// A prepared controller: plant, gain, tube, tightening, reference, cone.
 #[derive(Debug, Clone, PartialEq)]
@@ -111,31 +129,47 @@ impl Artifact {
     /// [`PrepareError::Faults`] for what only the mathematics can see: dimensions that do not
     /// match, a loop that does not contract, poles that cannot be placed.
     pub fn prepare(problem: &Problem) -> Result<Self, PrepareError> {
+        Self::prepare_within(problem, Budget::UNLIMITED)
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// As [`Artifact::prepare`]; [`PrepareError::Failure`] when interrupted.
+    pub fn prepare_within(problem: &Problem, budget: Budget<'_>) -> Result<Self, PrepareError> {
         let faults = dimension_faults(problem);
         if !faults.is_empty() {
             return Err(PrepareError::Faults(faults));
         }
-        let model = Model::new(problem);
+        let model = Model::new(problem, budget)?;
         let gain = choose_gain(&problem.gain, &model.a, &model.b)
             .map_err(|fault| PrepareError::Faults(vec![fault]))?;
-        Self::assemble(problem.clone(), model, gain)
-            .map_err(|fault| PrepareError::Faults(vec![fault]))
+        Self::assemble(problem.clone(), model, gain, budget)
     }
 
-    fn assemble(problem: Problem, model: Model, gain: DMatrix<f64>) -> Result<Self, Fault> {
+    fn assemble(
+        problem: Problem,
+        model: Model,
+        gain: DMatrix<f64>,
+        budget: Budget<'_>,
+    ) -> Result<Self, PrepareError> {
         let closed_loop = &model.a + product(&model.b, &gain);
         let radius = spectral_radius(&closed_loop);
         let not_schur = |what: String| {
-            Fault::new("gain", "A + B K with all eigenvalues inside the unit circle", what)
+            let expected = "A + B K with all eigenvalues inside the unit circle";
+            PrepareError::Faults(vec![Fault::new("gain", expected, what)])
         };
         if !(radius < 1.0) {
             return Err(not_schur(format!("largest modulus {radius}")));
         }
-        let tube = Tube::new(&closed_loop, &gain, &model.disturbance)
-            .map_err(|error| not_schur(error.to_string()))?;
-        let decrease = tube.decrease(problem.weights.fuel, problem.weights.tracking);
+        let tube = Tube::new(&closed_loop, &gain, &model.disturbance, budget);
+        let tube = tube.map_err(|error| match error {
+            TubeError::NoContraction => not_schur(error.to_string()),
+            TubeError::Interrupted(why) => why.into(),
+        })?;
+        let decrease = tube.decrease(problem.weights.fuel, problem.weights.tracking, budget)?;
         let disturbance_measure = model.disturbance.measure();
-        let tables = PlantTables::new(&model.a, &model.b, problem.horizon_max);
+        let tables = PlantTables::within(&model.a, &model.b, problem.horizon_max, budget)?;
         let mut artifact = Self {
             problem,
             model,
@@ -152,12 +186,12 @@ impl Artifact {
             horizon_usable: 0,
             disturbance_measure,
         };
-        artifact.tighten_inputs();
+        artifact.tighten_inputs(budget)?;
         Ok(artifact)
     }
 
     /// V(j) = U less K S(j), for every stage until it is empty. [Quartullo2025a, eq. 20]
-    fn tighten_inputs(&mut self) {
+    fn tighten_inputs(&mut self, budget: Budget<'_>) -> Result<(), Interruption> {
         let m = self.tables.inputs();
         let horizon_max = self.problem.horizon_max;
         let widths = self.tube.input_half_widths(horizon_max, m);
@@ -170,11 +204,12 @@ impl Artifact {
         self.input_normals = rows.iter().flat_map(|(normal, _)| normal.iter().copied()).collect();
         let mut margins = vec![0.0; rows.len()];
         for stage in 0..horizon_max {
+            budget.check()?;
             let width = |i: usize| if tightened { widths[(stage, i)] } else { 0.0 };
             let lower: Vec<f64> = (0..m).map(|i| self.model.input_lower[i] + width(i)).collect();
             let upper: Vec<f64> = (0..m).map(|i| self.model.input_upper[i] - width(i)).collect();
             if lower.iter().zip(&upper).any(|(lower, upper)| lower > upper) {
-                return;
+                return Ok(());
             }
             self.input_lower.extend(lower);
             self.input_upper.extend(upper);
@@ -186,6 +221,7 @@ impl Artifact {
             }
             self.horizon_usable = stage + 1;
         }
+        Ok(())
     }
 
     /// By how much an input lies outside U, if it does by more than rounding.
@@ -262,10 +298,15 @@ impl Artifact {
         let mut writer = Writer::default();
         writer.bytes(MAGIC);
         encoding::write_problem(&mut writer, &self.problem);
+        self.write_found(&mut writer);
+        writer.finish()
+    }
+
+    /// What was found for the problem: all that is not recomputed from it, and the check value.
+    pub(super) fn write_found(&self, writer: &mut Writer) {
         writer.matrix(&self.gain);
         writer.number(self.decrease.lambda_bar);
         writer.count(self.tube.terms());
-        writer.finish()
     }
 
     /// Reads and checks what [`Artifact::to_bytes`] wrote.
@@ -274,47 +315,78 @@ impl Artifact {
     /// [`DecodeError`] for bytes that are not an artifact, and for an artifact whose recomputed
     /// guarantee differs from the stored one.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, DecodeError> {
+        Self::from_bytes_within(bytes, Budget::UNLIMITED).map_err(ReadError::uninterrupted)
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// [`ReadError`].
+    pub fn from_bytes_within(bytes: &[u8], budget: Budget<'_>) -> Result<Self, ReadError> {
         let mut reader = Reader::new(bytes);
         if reader.bytes()? != MAGIC {
-            return Err(reader.fault("not a variable-horizon artifact of this layout"));
+            return Err(reader.fault("not a variable-horizon artifact of this layout").into());
         }
         let problem = encoding::read_problem(&mut reader)?;
+        let artifact = Self::read_found(problem, &mut reader, budget)?;
+        reader.end()?;
+        Ok(artifact)
+    }
+
+    /// Reads and checks what [`Artifact::write_found`] wrote.
+    pub(super) fn read_found(
+        problem: Problem,
+        reader: &mut Reader<'_>,
+        budget: Budget<'_>,
+    ) -> Result<Self, ReadError> {
         let gain = reader.matrix()?;
         let (lambda_bar, terms) = (reader.number()?, reader.count()?);
-        reader.end()?;
         if let Some(fault) = dimension_faults(&problem).first() {
-            return Err(reader.fault(format!("{}: {}", fault.field, fault.got)));
+            return Err(reader.fault(format!("{}: {}", fault.field, fault.got)).into());
         }
-        let model = Model::new(&problem);
+        let model = Model::new(&problem, budget).map_err(|error| unread(error, reader))?;
         if gain.shape() != (model.b.ncols(), model.a.nrows()) {
-            return Err(reader.fault("the gain does not fit the plant"));
+            return Err(reader.fault("the gain does not fit the plant").into());
         }
-        let artifact = Self::assemble(problem, model, gain)
-            .map_err(|fault| reader.fault(format!("{}: {}", fault.field, fault.got)))?;
+        let artifact =
+            Self::assemble(problem, model, gain, budget).map_err(|error| unread(error, reader))?;
         if artifact.decrease.lambda_bar.to_bits() != lambda_bar.to_bits()
             || artifact.tube.terms() != terms
         {
-            return Err(reader.fault("the recomputed guarantee differs from the stored one"));
+            return Err(reader
+                .fault("the recomputed guarantee differs from the stored one")
+                .into());
         }
         Ok(artifact)
     }
 }
 
 impl Model {
-    fn new(problem: &Problem) -> Self {
+    /// # Errors
+    /// A target that turns too often to follow it to the end of the longest mission.
+    fn new(problem: &Problem, budget: Budget<'_>) -> Result<Self, PrepareError> {
         match &problem.plant {
             Plant::Hill(plant) => {
-                Self::hill(plant, problem.steps_max.saturating_add(problem.horizon_max) + 1)
+                let samples = problem.steps_max.saturating_add(problem.horizon_max) + 1;
+                Self::hill(plant, samples, budget)
             }
-            Plant::Linear(plant) => Self::linear(plant),
+            Plant::Linear(plant) => Ok(Self::linear(plant)),
         }
     }
 
-    fn hill(plant: &HillPlant, samples: usize) -> Self {
+    fn hill(plant: &HillPlant, needed: usize, budget: Budget<'_>) -> Result<Self, PrepareError> {
         let (a, b) = clohessy_wiltshire(plant.sample_angle.radians());
         let scaling = HillScaling::new(plant.mean_motion_rad_s, plant.acceleration_max.m_s2());
         let sample_time_s = plant.sample_angle.radians() / plant.mean_motion_rad_s;
-        let samples = plant.target.samples(plant.mean_motion_rad_s, sample_time_s, samples);
+        let motion = &plant.target;
+        let samples = motion.samples(plant.mean_motion_rad_s, sample_time_s, needed, budget)?;
+        if samples.len() < needed {
+            return Err(PrepareError::Faults(vec![Fault::new(
+                "hill.rotation.torque_free",
+                format!("a motion slow enough to be followed for {needed} samples, or fewer steps"),
+                format!("one that can be followed for {}", samples.len()),
+            )]));
+        }
         let reference = samples
             .iter()
             .map(|sample| {
@@ -328,7 +400,8 @@ impl Model {
             let faces = samples.iter().map(|s| cone.faces(port(s) / scaling.position_unit_m));
             Corridor::Cone(faces.collect())
         });
-        Self {
+        budget.check()?;
+        Ok(Self {
             disturbance: plant.disturbance.zonotope(&scaling, &a, &b),
             a,
             b,
@@ -339,7 +412,7 @@ impl Model {
             input_lower: DVector::from_element(3, -1.0),
             input_upper: DVector::from_element(3, 1.0),
             input_set: None,
-        }
+        })
     }
 
     fn linear(plant: &LinearPlant) -> Self {
@@ -388,7 +461,7 @@ fn choose_gain(
 
 /// Sizes that must fit each other; the wire checks them too, a direct caller may not have.
 fn dimension_faults(problem: &Problem) -> Vec<Fault> {
-    let mut faults = Vec::new();
+    let mut faults = size_faults(problem);
     let mut expect = |field: &str, expected: String, got: String| {
         if expected != got {
             faults.push(Fault::new(field, expected, got));
@@ -454,6 +527,67 @@ fn dimension_faults(problem: &Problem) -> Vec<Fault> {
         }
     }
     faults.extend(table_faults(problem));
+    faults
+}
+
+/// See [`Controller::memory_bytes`](crate::control::Controller::memory_bytes).
+pub(super) fn memory_bytes(problem: &Problem) -> usize {
+    /// Attitude, reference, faces of the cone and what each is made from.
+    const SAMPLE_BYTES: usize = 640;
+    /// Of Hill's disturbances but those given one by one.
+    const GENERATORS: usize = 16;
+    let (n, m, generators, samples) = match &problem.plant {
+        Plant::Hill(plant) => {
+            use crate::mission::DisturbanceSet::Generators;
+            let generators = match &plant.disturbance {
+                Generators(generators) => generators.ncols(),
+                _ => GENERATORS,
+            };
+            (6, 3, generators, problem.steps_max.saturating_add(problem.horizon_max))
+        }
+        Plant::Linear(plant) => {
+            let generators = plant.disturbance.generators().ncols();
+            (plant.a.nrows(), plant.b.ncols(), generators, plant.reference.len())
+        }
+    };
+    let kernel = problem.horizon_max.saturating_mul(m);
+    let numbers = kernel.saturating_mul(kernel);
+    let numbers = numbers.saturating_add(problem.horizon_max.saturating_mul(n).saturating_mul(n));
+    numbers
+        .saturating_mul(size_of::<f64>())
+        .saturating_add(Tube::bytes_max(n, m, generators))
+        .saturating_add(samples.saturating_mul(SAMPLE_BYTES))
+}
+
+/// Sizes that nobody needs and whose work would not end.
+fn size_faults(problem: &Problem) -> Vec<Fault> {
+    let mut faults = Vec::new();
+    let mut limit = |field: &str, most: usize, got: usize| {
+        if got > most {
+            faults.push(Fault::new(field, format!("at most {most}"), got.to_string()));
+        }
+    };
+    limit("horizon_max", SIZES_MAX.horizon, problem.horizon_max);
+    limit("steps_max", SIZES_MAX.steps, problem.steps_max);
+    match &problem.plant {
+        Plant::Hill(plant) => {
+            if let crate::mission::DisturbanceSet::Generators(generators) = &plant.disturbance {
+                let field = "hill.disturbance.generators_nd";
+                limit(field, SIZES_MAX.generators, generators.ncols());
+            }
+        }
+        Plant::Linear(plant) => {
+            limit("linear.a", SIZES_MAX.states, plant.a.nrows().max(plant.a.ncols()));
+            limit("linear.b", SIZES_MAX.inputs, plant.b.ncols());
+            let generators = plant.disturbance.generators().ncols();
+            limit("linear.disturbance", SIZES_MAX.generators, generators);
+            for (field, set) in
+                [("linear.input_set", &plant.input_set), ("linear.state_set", &plant.state_set)]
+            {
+                limit(field, SIZES_MAX.rows, set.as_ref().map_or(0, |s| s.offsets().len()));
+            }
+        }
+    }
     faults
 }
 

@@ -84,11 +84,11 @@ pub use problem::{
 pub use state::State;
 pub use verification::verify_step;
 
-use super::{Controller, PrepareError, StepError};
-use crate::budget::Budget;
+use super::{Controller, Method, PrepareError, StepError, shard::Place};
+use crate::{budget::Budget, reach::ReadError};
 
 /// Version of the mathematics: raised when the same problem can give different bytes.
-pub const VERSION: &str = "2";
+pub const VERSION: &str = "3";
 
 /// The method, as a [`Controller`].
 #[derive(Debug, Clone, Copy)]
@@ -102,6 +102,12 @@ impl Controller for VariableHorizon {
     type Measurement = Measurement;
     type Answer = Step;
 
+    /// The inverse of the simplex's kernel, should every input of the longest horizon have its row;
+    /// the tube, should its sums be as long as they may; reference and cone at every step.
+    fn memory_bytes(problem: &Problem) -> usize {
+        artifact::memory_bytes(problem)
+    }
+
     /// One: preparing takes less than a millisecond.
     fn shards(_problem: &Problem) -> usize {
         1
@@ -113,17 +119,30 @@ impl Controller for VariableHorizon {
         budget: Budget<'_>,
     ) -> Result<Artifact, PrepareError> {
         budget.check()?;
-        Artifact::prepare(problem)
+        Artifact::prepare_within(problem, budget)
+    }
+
+    fn shard_to_bytes(problem: &Problem, shard: &Artifact) -> Vec<u8> {
+        place(problem).seal(0, |writer| shard.write_found(writer))
+    }
+
+    fn shard_from_bytes(
+        problem: &Problem,
+        bytes: &[u8],
+        budget: Budget<'_>,
+    ) -> Result<Artifact, ReadError> {
+        let place = place(problem);
+        place.open(bytes, budget, |_, reader| Artifact::read_found(problem.clone(), reader, budget))
     }
 
     fn merge(
         problem: &Problem,
         shards: Vec<Artifact>,
-        _budget: Budget<'_>,
+        budget: Budget<'_>,
     ) -> Result<Artifact, PrepareError> {
         match shards.into_iter().next() {
             Some(artifact) => Ok(artifact),
-            None => Artifact::prepare(problem),
+            None => Artifact::prepare_within(problem, budget),
         }
     }
 
@@ -139,6 +158,10 @@ impl Controller for VariableHorizon {
     ) -> Result<Step, StepError> {
         step::step(artifact, state, measurement, budget)
     }
+}
+
+fn place(problem: &Problem) -> Place {
+    Place { method: Method::VariableHorizon, problem: problem.canonical_bytes(), shards: 1 }
 }
 
 /// The plan from the mission's start: with tube feedback for

@@ -206,7 +206,7 @@ mod tests {
             let mut question = Question::new(&program, Budget::UNLIMITED);
             let unrelaxed = question.solve(None).unwrap();
             let fast = question.least(&unrelaxed, family, LARGEST);
-            let general = least_relaxation(&program, relaxed);
+            let general = least_relaxation(&program, relaxed, Budget::UNLIMITED).unwrap();
             match (fast, general) {
                 (Some(fast), Some(general)) => {
                     assert!(

@@ -3,18 +3,28 @@
 use ::clarabel::{
     algebra::CscMatrix,
     solver::{
-        DefaultSettings, DefaultSolver, IPSolver, SolverStatus,
+        DefaultSettings, DefaultSolver, SolverStatus,
         SupportedConeT::{self, NonnegativeConeT},
     },
 };
 
 use super::{ActiveRow, QuadraticProgram, QuadraticSolution, verify::objective};
-use crate::program::{Clarabel, Status};
+use crate::{
+    budget::{Budget, Interruption},
+    program::{Clarabel, Status, clarabel::run},
+};
 
 impl Clarabel {
     /// Solves a dense quadratic program, looking at all rows in every iteration.
-    #[must_use]
-    pub fn solve_quadratic(&self, program: &QuadraticProgram<'_>) -> QuadraticSolution {
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn solve_quadratic(
+        &self,
+        program: &QuadraticProgram<'_>,
+        budget: Budget<'_>,
+    ) -> Result<QuadraticSolution, Interruption> {
+        budget.check()?;
         let (n, rows) = (program.cost.variables(), program.rows.len());
         let hessian = dense(n, n, |i, j| {
             // The upper triangle only.
@@ -34,19 +44,19 @@ impl Clarabel {
         let built =
             DefaultSolver::new(&hessian, program.gradient, &matrix, &right, &cones, settings);
         let Ok(mut solver) = built else {
-            return QuadraticSolution {
+            return Ok(QuadraticSolution {
                 status: Status::NumericalFailure,
                 point: vec![0.0; n],
                 objective: 0.0,
                 active: Vec::new(),
                 iterations: 0,
                 scans: 0,
-            };
+            });
         };
-        solver.solve();
+        run(&mut solver, budget)?;
         let answer = solver.solution;
         let multipliers = answer.z.iter().enumerate().filter(|(_, y)| **y > 0.0);
-        QuadraticSolution {
+        Ok(QuadraticSolution {
             status: match answer.status {
                 SolverStatus::Solved => Status::Optimal,
                 SolverStatus::PrimalInfeasible => Status::PrimalInfeasible,
@@ -61,7 +71,7 @@ impl Clarabel {
             point: answer.x,
             iterations: answer.iterations as usize,
             scans: answer.iterations as usize,
-        }
+        })
     }
 }
 

@@ -8,7 +8,7 @@
 
 use super::{
     ActiveRow, ActiveSet, Entry, QuadraticProgram, QuadraticSolution, prove_infeasible,
-    verify_quadratic,
+    verify::verify_quadratic_within,
 };
 use crate::{
     budget::{Budget, Interruption},
@@ -28,6 +28,8 @@ const RADIUS_ACCEPTED: f64 = 1e6;
 const REFINEMENTS_MAX: usize = 4;
 /// Rows of a block, of which a look keeps the worst.
 const BLOCK: usize = 64;
+/// Rows between two looks at the budget.
+const BUDGET_PERIOD: usize = 64 * BLOCK;
 /// Rows that join the working set after a look, at most.
 const JOINING_MAX: usize = 24;
 
@@ -50,7 +52,7 @@ impl DualActiveSet {
     /// from the program alone; else `BudgetExhausted` or `NumericalFailure`.
     ///
     /// # Errors
-    /// The [`Interruption`] of the budget, asked at every look at all rows.
+    /// The [`Interruption`] of the budget, asked whenever a row enters and while all are looked at.
     pub fn solve(
         &mut self,
         program: &QuadraticProgram<'_>,
@@ -89,6 +91,7 @@ impl DualActiveSet {
         self.active.start_from(program.cost, rows);
         loop {
             while let Some(row) = self.worst_of_working(program) {
+                budget.check()?;
                 let (normal, offset) = (program.rows.normal(row), program.offsets[row]);
                 match self.active.enter(row, normal, offset, iterations_max) {
                     Entry::Active => {}
@@ -98,13 +101,12 @@ impl DualActiveSet {
                     }
                 }
             }
-            budget.check()?;
             self.active.settle();
             if !self.active.point().iter().all(|x| x.is_finite()) {
                 return Ok(self.solution(program, Status::NumericalFailure));
             }
-            if !self.look_at_all(program) {
-                return Ok(self.optimal(program));
+            if !self.look_at_all(program, budget)? {
+                return self.optimal(program, budget);
             }
         }
     }
@@ -124,12 +126,19 @@ impl DualActiveSet {
     }
 
     /// Lets the worst row of every block join the working set; false if no row is violated.
-    fn look_at_all(&mut self, program: &QuadraticProgram<'_>) -> bool {
+    fn look_at_all(
+        &mut self,
+        program: &QuadraticProgram<'_>,
+        budget: Budget<'_>,
+    ) -> Result<bool, Interruption> {
         let rows = program.rows;
         self.scans += 1;
         self.joining.clear();
         rows.pad(self.active.point(), &mut self.padded);
         for first in (0..rows.len()).step_by(BLOCK) {
+            if first % BUDGET_PERIOD == 0 {
+                budget.check()?;
+            }
             let mut worst = (0.0, first);
             for row in first..(first + BLOCK).min(rows.len()) {
                 let violation = violation(program, row, &self.padded);
@@ -151,22 +160,26 @@ impl DualActiveSet {
                 joined = true;
             }
         }
-        joined
+        Ok(joined)
     }
 
-    fn optimal(&mut self, program: &QuadraticProgram<'_>) -> QuadraticSolution {
+    fn optimal(
+        &mut self,
+        program: &QuadraticProgram<'_>,
+        budget: Budget<'_>,
+    ) -> Result<QuadraticSolution, Interruption> {
         for _ in 0..REFINEMENTS_MAX {
             let solution = self.solution(program, Status::Optimal);
-            let residuals = verify_quadratic(program, &solution);
+            let residuals = verify_quadratic_within(program, &solution, budget)?;
             if residuals.violation <= FEASIBILITY_ACCEPTED
                 && residuals.stationarity <= STATIONARITY_ACCEPTED
                 && residuals.least_multiplier >= 0.0
             {
-                return solution;
+                return Ok(solution);
             }
             self.active.refine(program.cost, program.gradient);
         }
-        self.solution(program, Status::NumericalFailure)
+        Ok(self.solution(program, Status::NumericalFailure))
     }
 
     fn infeasible(&self, program: &QuadraticProgram<'_>, row: usize) -> QuadraticSolution {

@@ -20,6 +20,10 @@ pub use verify::{InfeasibilityProof, QuadraticResiduals, prove_infeasible, verif
 use nalgebra::DMatrix;
 
 use super::Status;
+use crate::budget::{Budget, Interruption};
+
+/// Rows between two looks at the budget where each takes one product.
+const BUDGET_PERIOD: usize = 4096;
 
 /// Rows are padded to a multiple of this, so that sums run in four lanes without a remainder.
 const LANES: usize = 4;
@@ -228,6 +232,30 @@ impl DenseRows {
             return;
         }
         products.extend(self.normals.chunks_exact(self.stride).map(|a| lanes_dot(a, &padded)));
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// The [`Interruption`] of the budget.
+    pub fn products_within(
+        &self,
+        point: &[f64],
+        products: &mut Vec<f64>,
+        budget: Budget<'_>,
+    ) -> Result<(), Interruption> {
+        let mut padded = Vec::with_capacity(self.stride);
+        self.pad(point, &mut padded);
+        products.clear();
+        if self.stride == 0 {
+            products.resize(self.len(), 0.0);
+            return Ok(());
+        }
+        for rows in self.normals.chunks(BUDGET_PERIOD * self.stride) {
+            budget.check()?;
+            products.extend(rows.chunks_exact(self.stride).map(|a| lanes_dot(a, &padded)));
+        }
+        Ok(())
     }
 }
 

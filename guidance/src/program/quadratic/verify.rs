@@ -1,6 +1,7 @@
 //! What an answer is worth, recomputed from the program alone: no factor of a solver is used.
 
 use super::{ActiveRow, DenseRows, QuadraticProgram, QuadraticSolution};
+use crate::budget::{Budget, Interruption};
 
 /// How far a point and its multipliers are from the conditions of optimality.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,9 +27,19 @@ pub fn verify_quadratic(
     program: &QuadraticProgram<'_>,
     solution: &QuadraticSolution,
 ) -> QuadraticResiduals {
+    verify_quadratic_within(program, solution, Budget::UNLIMITED)
+        .expect("this budget never interrupts")
+}
+
+/// The same, if there is time.
+pub(super) fn verify_quadratic_within(
+    program: &QuadraticProgram<'_>,
+    solution: &QuadraticSolution,
+    budget: Budget<'_>,
+) -> Result<QuadraticResiduals, Interruption> {
     let point = &solution.point;
     let mut products = Vec::with_capacity(program.rows.len());
-    program.rows.products(point, &mut products);
+    program.rows.products_within(point, &mut products, budget)?;
     let mut worst = (f64::NEG_INFINITY, None);
     for (row, product) in products.iter().enumerate() {
         let (offset, scale) = (program.offsets[row], program.rows.scale(row));
@@ -53,14 +64,14 @@ pub fn verify_quadratic(
         gap += active.multiplier * (products[active.row] - program.offsets[active.row]).abs();
     }
     let objective = objective(program, point);
-    QuadraticResiduals {
+    Ok(QuadraticResiduals {
         objective,
         stationarity: gradient.iter().fold(0.0_f64, |a, x| a.max(x.abs())) / size,
         violation: worst.0,
         worst_row: worst.1,
         least_multiplier: least,
         gap: gap / (1.0 + objective.abs()),
-    }
+    })
 }
 
 /// What a ray y >= 0 proves.
