@@ -8,9 +8,10 @@ use vbar_proto::v1;
 
 use super::{
     Artifact, ArtifactId, Candidate, Claimed, Door, ElapsedAndState, Limits, Order, Parse, Path,
-    PlanVerdict, Planning, Problem, Provenance, Render, Step, count,
+    PlanVerdict, Planning, Problem, Provenance, Render, Step,
+    build::BUILD,
+    count,
     paging::{page_size, page_token},
-    types::BUILD_VERSION,
 };
 
 /// Which controller decides.
@@ -377,7 +378,8 @@ impl Render for InfoAnswer {
             version: method.version().to_owned(),
         };
         v1::GetServerInfoResponse {
-            build_version: BUILD_VERSION.to_owned(),
+            build_version: BUILD.version.to_owned(),
+            build: Some(BUILD.message()),
             methods: Method::ALL.into_iter().map(method).collect(),
             limits: Some(v1::Limits {
                 request_bytes_max: i64::try_from(self.request_bytes_max).unwrap_or(i64::MAX),
@@ -391,6 +393,7 @@ impl Render for InfoAnswer {
                 report_states_max: count(self.limits.report_states_max),
                 sampled_rows_max: count(self.limits.sampled_rows_max),
                 plant_vertices_max: count(self.limits.plant_vertices_max),
+                problem_bytes_max: i64::try_from(self.limits.problem_bytes_max).unwrap_or(i64::MAX),
                 concurrent_computations_max: count(self.compute_threads),
                 computation_time_max_s: self.computation_time_max.as_secs_f64(),
             }),

@@ -24,7 +24,6 @@ use super::ArtifactId;
 
 const MAGIC: &[u8; 4] = b"VBCS";
 const FORMAT_VERSION: u8 = 1;
-const CHECKSUM_LENGTH: usize = 8;
 /// Far above what any method writes (a plan tail and an active set), far below a request's limit.
 pub(crate) const LENGTH_MAX: usize = 256 * 1024;
 
@@ -65,6 +64,9 @@ pub(crate) enum StateFault {
 }
 
 impl<'a> ControllerState<'a> {
+    /// Bytes of the checksum at the end.
+    pub(crate) const CHECKSUM_LENGTH: usize = 8;
+
     /// Writes the envelope.
     pub(crate) fn encode(&self) -> Bytes {
         let name = self.method.name().as_bytes();
@@ -78,7 +80,7 @@ impl<'a> ControllerState<'a> {
         bytes.extend_from_slice(&length(self.payload));
         bytes.extend_from_slice(self.payload);
         let checksum = Sha256::digest(&bytes);
-        bytes.extend_from_slice(&checksum[..CHECKSUM_LENGTH]);
+        bytes.extend_from_slice(&checksum[..Self::CHECKSUM_LENGTH]);
         bytes.into()
     }
 
@@ -92,9 +94,9 @@ impl<'a> ControllerState<'a> {
         if version != FORMAT_VERSION {
             return Err(StateFault::Version(version));
         }
-        let split = bytes.len().checked_sub(CHECKSUM_LENGTH).ok_or(StateFault::Length)?;
+        let split = bytes.len().checked_sub(Self::CHECKSUM_LENGTH).ok_or(StateFault::Length)?;
         let (sealed, checksum) = bytes.split_at(split);
-        if Sha256::digest(sealed)[..CHECKSUM_LENGTH] != *checksum {
+        if Sha256::digest(sealed)[..Self::CHECKSUM_LENGTH] != *checksum {
             return Err(StateFault::Checksum);
         }
         let name_length = usize::from(take(&mut rest, 1)?[0]);
@@ -106,7 +108,7 @@ impl<'a> ControllerState<'a> {
         let step_index = u32::from_le_bytes(array(take(&mut rest, 4)?)?);
         let length = u32::from_le_bytes(array(take(&mut rest, 4)?)?);
         let payload = take(&mut rest, usize::try_from(length).map_err(|_| StateFault::Length)?)?;
-        if rest.len() != CHECKSUM_LENGTH {
+        if rest.len() != Self::CHECKSUM_LENGTH {
             return Err(StateFault::Length);
         }
         Ok(Self { method, artifact_id, step_index, payload })

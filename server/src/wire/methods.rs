@@ -7,7 +7,7 @@
 use std::{any::Any, fmt, marker::PhantomData, sync::Arc};
 
 use vbar_guidance::{
-    Budget, Method,
+    Budget, Interruption, Method,
     control::{
         Certificate, Controller, Failure, Fault, Infeasibility, PrepareError, StepError,
         abort_safe::{self, AbortSafe},
@@ -15,11 +15,12 @@ use vbar_guidance::{
         offline_sampling::OfflineSampling,
         variable_horizon::VariableHorizon,
     },
+    reach::ReadError,
 };
 use vbar_proto::v1::{self, compute_plan_response::Outcome, problem::Method as Message};
 
 use super::{
-    Claimed, Document, Door, ElapsedAndState, Missing, Order, Parse, Path, Violations,
+    Claimed, Document, Door, ElapsedAndState, Missing, Order, Parse, Path, Unwritten, Violations,
     disturbance_feedback as df, export, types,
 };
 
@@ -49,8 +50,17 @@ pub(super) trait Wired:
     /// Finds every fault that only the mathematics sees: a whole precompute, unless the method
     /// knows a shorter way.
     fn check(problem: &Self::Problem, budget: Budget<'_>) -> Result<(), PrepareError> {
+        Self::prepare_in_time(problem, budget).map(drop)
+    }
+
+    /// The artifact, or something certified to fly instead when the deadline comes before it.
+    fn prepare_in_time(
+        problem: &Self::Problem,
+        budget: Budget<'_>,
+    ) -> Result<InTime<Self::Artifact>, PrepareError> {
         let shards = (0..Self::shards(problem)).map(|i| Self::run_shard(problem, i, budget));
-        Self::merge(problem, shards.collect::<Result<_, _>>()?, budget).map(drop)
+        let artifact = Self::merge(problem, shards.collect::<Result<_, _>>()?, budget)?;
+        Ok(InTime { artifact, is_cut_short: false })
     }
 
     /// The problem an artifact was made for.
@@ -58,7 +68,7 @@ pub(super) trait Wired:
     /// Its own bytes.
     fn artifact_to_bytes(artifact: &Self::Artifact) -> Vec<u8>;
     /// Reads and checks again what [`Wired::artifact_to_bytes`] wrote.
-    fn artifact_from_bytes(bytes: &[u8]) -> Result<Self::Artifact, String>;
+    fn artifact_from_bytes(bytes: &[u8], budget: Budget<'_>) -> Result<Self::Artifact, ReadError>;
     /// Writes the method's own summary.
     fn render_summary(artifact: &Self::Artifact) -> v1::artifact::Summary;
     /// The artifact as a plan that can be kept and flown, if that is what it is.
@@ -113,6 +123,61 @@ pub(super) trait Wired:
         let what = format!("{} decides step by step and has no plan", Self::METHOD.name());
         Err(Failure::Numerical(what).into())
     }
+}
+
+/// The functions of [`Wired`] that are the same words for every method, because guidance's types
+/// have the same names for the same things.
+macro_rules! same_for_every_method {
+    () => {
+        fn canonical_bytes(problem: &Self::Problem) -> Vec<u8> {
+            problem.canonical_bytes()
+        }
+
+        fn problem(artifact: &Self::Artifact) -> &Self::Problem {
+            artifact.problem()
+        }
+
+        fn artifact_to_bytes(artifact: &Self::Artifact) -> Vec<u8> {
+            artifact.to_bytes()
+        }
+
+        fn artifact_from_bytes(
+            bytes: &[u8],
+            budget: vbar_guidance::Budget<'_>,
+        ) -> Result<Self::Artifact, vbar_guidance::reach::ReadError> {
+            <Self::Artifact>::from_bytes_within(bytes, budget)
+        }
+
+        fn step_index(state: &Self::State) -> usize {
+            state.step_index()
+        }
+
+        fn state_to_bytes(state: &Self::State) -> Vec<u8> {
+            state.to_bytes()
+        }
+
+        fn state_from_bytes(bytes: &[u8]) -> Result<Self::State, String> {
+            <Self::State>::from_bytes(bytes).map_err(|fault| fault.to_string())
+        }
+
+        fn next(step: &Self::Answer) -> &Self::State {
+            &step.next
+        }
+
+        fn certificate(step: &Self::Answer) -> Option<&Certificate> {
+            step.certificate.as_ref()
+        }
+    };
+}
+pub(super) use same_for_every_method;
+
+/// What a precompute with a deadline comes to.
+#[derive(Debug)]
+pub(crate) struct InTime<A> {
+    /// The artifact, or what can be flown instead.
+    pub(crate) artifact: A,
+    /// It is not the problem's artifact: there was no time for that.
+    pub(crate) is_cut_short: bool,
 }
 
 /// What `ComputePlan` means for a method.
@@ -214,7 +279,14 @@ fn asked<M: Wired>(
     path: Path<'_>,
     door: &mut Door,
 ) -> Option<Problem> {
-    M::Problem::parse(message, path, door).map(|problem| Problem(Arc::new(Asked::<M>(problem))))
+    let problem = M::Problem::parse(message, path, door)?;
+    let problem = Problem(Arc::new(Asked::<M>(problem)));
+    let (bytes, most) = (problem.memory_bytes(), door.limits.problem_bytes_max);
+    if bytes > most {
+        let expected = format!("a problem that takes at most about {} MiB of memory", most >> 20);
+        return door.refuse(path, expected, format!("one that takes about {} MiB", bytes >> 20));
+    }
+    Some(problem)
 }
 
 impl Problem {
@@ -238,6 +310,11 @@ impl Problem {
         self.0.canonical_bytes()
     }
 
+    /// About the most bytes that a precompute and what it makes take, from dimensions alone.
+    pub(crate) fn memory_bytes(&self) -> usize {
+        self.0.memory_bytes()
+    }
+
     /// Number of shards of its precompute, at least 1.
     pub(crate) fn shards(&self) -> usize {
         self.0.shards()
@@ -250,6 +327,30 @@ impl Problem {
         budget: Budget<'_>,
     ) -> Result<Shard, PrepareError> {
         self.0.run_shard(shard, budget)
+    }
+
+    /// Bytes of a shard, for whoever merges it elsewhere.
+    ///
+    /// # Panics
+    /// If the shard is one of another method.
+    pub(crate) fn shard_to_bytes(&self, shard: &Shard) -> Vec<u8> {
+        self.0.shard_to_bytes(shard)
+    }
+
+    /// Reads and checks what [`Problem::shard_to_bytes`] wrote for this problem, however long that
+    /// takes.
+    #[cfg(feature = "fuzzing")]
+    pub(crate) fn shard_from_bytes(&self, bytes: &[u8]) -> Result<Shard, Unread> {
+        self.shard_from_bytes_within(bytes, Budget::UNLIMITED)
+    }
+
+    /// The same, if there is time.
+    pub(crate) fn shard_from_bytes_within(
+        &self,
+        bytes: &[u8],
+        budget: Budget<'_>,
+    ) -> Result<Shard, Unread> {
+        self.0.shard_from_bytes(bytes, budget)
     }
 
     /// Puts shards, in their order, together.
@@ -265,6 +366,14 @@ impl Problem {
     pub(crate) fn prepare(&self, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
         let shards = (0..self.shards()).map(|shard| self.run_shard(shard, budget));
         self.merge(shards.collect::<Result<_, _>>()?, budget)
+    }
+
+    /// The same, or something certified to fly instead when the deadline comes before it.
+    pub(crate) fn prepare_in_time(
+        &self,
+        budget: Budget<'_>,
+    ) -> Result<InTime<Artifact>, PrepareError> {
+        self.0.prepare_in_time(budget)
     }
 
     /// Finds every fault that only the mathematics sees, and makes nothing.
@@ -301,9 +410,19 @@ impl Artifact {
         self.0.to_bytes()
     }
 
-    /// Reads and checks again what [`Artifact::to_bytes`] wrote.
-    pub(crate) fn from_bytes(method: Method, bytes: &[u8]) -> Result<Self, String> {
-        wired(method).artifact_from_bytes(bytes)
+    /// Reads and checks again what [`Artifact::to_bytes`] wrote, however long that takes.
+    #[cfg(feature = "fuzzing")]
+    pub(crate) fn from_bytes(method: Method, bytes: &[u8]) -> Result<Self, Unread> {
+        Self::from_bytes_within(method, bytes, Budget::UNLIMITED)
+    }
+
+    /// The same, if there is time.
+    pub(crate) fn from_bytes_within(
+        method: Method,
+        bytes: &[u8],
+        budget: Budget<'_>,
+    ) -> Result<Self, Unread> {
+        wired(method).artifact_from_bytes(bytes, budget)
     }
 
     /// The state before the first step.
@@ -345,9 +464,23 @@ impl Artifact {
         self.0.as_plan()
     }
 
-    /// Writes a plan as a document; `None` for what is no plan.
+    /// Writes a plan as a document, however long that takes; `None` for what is no plan.
     pub(crate) fn export(&self, plan_id: &str, order: &Order) -> Option<Result<Document, Missing>> {
-        self.0.as_plan().map(|plan| export::export(plan, plan_id, order))
+        let written = self.export_within(plan_id, order, Budget::UNLIMITED)?;
+        Some(written.map_err(|unwritten| match unwritten {
+            Unwritten::Lacks(missing) => missing,
+            Unwritten::Interrupted(why) => unreachable!("an unlimited budget said {why:?}"),
+        }))
+    }
+
+    /// The same, if there is time.
+    pub(crate) fn export_within(
+        &self,
+        plan_id: &str,
+        order: &Order,
+        budget: Budget<'_>,
+    ) -> Option<Result<Document, Unwritten>> {
+        self.0.as_plan().map(|plan| export::export(plan, plan_id, order, budget))
     }
 
     /// Writes a plan with its mission; `None` for what is no plan.
@@ -430,15 +563,15 @@ impl Step {
 
 /// A method, without its values.
 trait AnyMethod: Sync {
-    fn artifact_from_bytes(&self, bytes: &[u8]) -> Result<Artifact, String>;
+    fn artifact_from_bytes(&self, bytes: &[u8], budget: Budget<'_>) -> Result<Artifact, Unread>;
     fn state_from_bytes(&self, bytes: &[u8]) -> Result<State, String>;
 }
 
 struct Of<M>(PhantomData<M>);
 
 impl<M: Wired> AnyMethod for Of<M> {
-    fn artifact_from_bytes(&self, bytes: &[u8]) -> Result<Artifact, String> {
-        M::artifact_from_bytes(bytes).map(Made::<M>::artifact)
+    fn artifact_from_bytes(&self, bytes: &[u8], budget: Budget<'_>) -> Result<Artifact, Unread> {
+        Ok(Made::<M>::artifact(M::artifact_from_bytes(bytes, budget)?))
     }
 
     fn state_from_bytes(&self, bytes: &[u8]) -> Result<State, String> {
@@ -451,8 +584,12 @@ trait AnyProblem: fmt::Debug + Send + Sync {
     fn canonical_bytes(&self) -> Vec<u8>;
     fn units(&self) -> types::Units;
     fn check(&self, budget: Budget<'_>) -> Result<(), PrepareError>;
+    fn prepare_in_time(&self, budget: Budget<'_>) -> Result<InTime<Artifact>, PrepareError>;
+    fn memory_bytes(&self) -> usize;
     fn shards(&self) -> usize;
     fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Shard, PrepareError>;
+    fn shard_to_bytes(&self, shard: &Shard) -> Vec<u8>;
+    fn shard_from_bytes(&self, bytes: &[u8], budget: Budget<'_>) -> Result<Shard, Unread>;
     fn merge(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<Artifact, PrepareError>;
 }
 
@@ -482,12 +619,30 @@ impl<M: Wired> AnyProblem for Asked<M> {
         M::check(&self.0, budget)
     }
 
+    fn prepare_in_time(&self, budget: Budget<'_>) -> Result<InTime<Artifact>, PrepareError> {
+        let InTime { artifact, is_cut_short } = M::prepare_in_time(&self.0, budget)?;
+        Ok(InTime { artifact: Made::<M>::artifact(artifact), is_cut_short })
+    }
+
+    fn memory_bytes(&self) -> usize {
+        M::memory_bytes(&self.0)
+    }
+
     fn shards(&self) -> usize {
         M::shards(&self.0)
     }
 
     fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<Shard, PrepareError> {
         M::run_shard(&self.0, shard, budget).map(|shard| Shard(Box::new(shard)))
+    }
+
+    fn shard_to_bytes(&self, Shard(shard): &Shard) -> Vec<u8> {
+        let own = shard.downcast_ref().expect("a problem is given its own method's shards");
+        M::shard_to_bytes(&self.0, own)
+    }
+
+    fn shard_from_bytes(&self, bytes: &[u8], budget: Budget<'_>) -> Result<Shard, Unread> {
+        Ok(Shard(Box::new(M::shard_from_bytes(&self.0, bytes, budget)?)))
     }
 
     fn merge(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<Artifact, PrepareError> {
@@ -678,6 +833,39 @@ impl<M: Wired> AnyStep for Decided<M> {
     }
 }
 
+/// Why what was kept is not read.
+#[derive(Debug)]
+pub(crate) enum Unread {
+    /// It is not what it should be.
+    Damaged(String),
+    /// Stopped from outside.
+    Interrupted(Interruption),
+}
+
+impl From<ReadError> for Unread {
+    fn from(error: ReadError) -> Self {
+        match error {
+            ReadError::Bytes(fault) => Self::Damaged(fault.to_string()),
+            ReadError::Interrupted(why) => Self::Interrupted(why),
+        }
+    }
+}
+
+/// Why a caller's plan is not taken.
+#[derive(Debug)]
+pub(crate) enum Unverified {
+    /// What does not hold.
+    Claims(Violations),
+    /// Stopped from outside.
+    Interrupted(Interruption),
+}
+
+impl From<Violations> for Unverified {
+    fn from(violations: Violations) -> Self {
+        Self::Claims(violations)
+    }
+}
+
 /// A plan that a caller brings, not checked yet.
 #[derive(Debug)]
 pub(crate) enum Candidate {
@@ -693,13 +881,28 @@ impl Candidate {
     /// # Errors
     /// Every claim that does not hold.
     pub(crate) fn verify(self) -> Result<Artifact, Violations> {
+        self.verify_within(Budget::UNLIMITED).map_err(|unverified| match unverified {
+            Unverified::Claims(violations) => violations,
+            Unverified::Interrupted(why) => unreachable!("an unlimited budget said {why:?}"),
+        })
+    }
+
+    /// The same, if there is time.
+    ///
+    /// # Errors
+    /// [`Unverified`].
+    pub(crate) fn verify_within(self, budget: Budget<'_>) -> Result<Artifact, Unverified> {
         let plan = match self {
-            Self::Document(claimed) => claimed.verify()?,
+            Self::Document(claimed) => claimed.verify(budget)?,
             Self::Binary(bytes) => {
-                disturbance_feedback::Plan::from_bytes(&bytes).map_err(|fault| {
-                    let expected = "a plan as PLAN_FORMAT_BINARY writes it";
-                    let fault = Fault::new("binary", expected, fault.to_string());
-                    Violations::under("", vec![fault])
+                let read = disturbance_feedback::Plan::from_bytes_within(&bytes, budget);
+                read.map_err(|error| match error {
+                    ReadError::Interrupted(why) => Unverified::Interrupted(why),
+                    ReadError::Bytes(fault) => {
+                        let expected = "a plan as PLAN_FORMAT_BINARY writes it";
+                        let fault = Fault::new("binary", expected, fault.to_string());
+                        Unverified::Claims(Violations::under("", vec![fault]))
+                    }
                 })?
             }
         };

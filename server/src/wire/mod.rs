@@ -6,10 +6,15 @@
 
 mod abort_safe;
 mod artifacts;
+mod build;
 mod calls;
 mod controller_state;
 mod disturbance_feedback;
 mod export;
+#[cfg(all(test, target_os = "linux"))]
+mod interruption;
+#[cfg(test)]
+mod memory;
 mod methods;
 mod offline_sampling;
 mod operations;
@@ -21,6 +26,8 @@ mod variable_horizon;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
+
+pub use build::{BUILD, Build};
 
 pub(crate) use abort_safe::{ReportAnswer, ReportCall, ReportFault};
 pub(crate) use artifacts::{
@@ -34,12 +41,12 @@ pub(crate) use calls::{
 };
 pub(crate) use controller_state::{ControllerState, StateFault};
 pub(crate) use disturbance_feedback::Claimed;
-pub(crate) use export::{Document, Missing, OcmBurn, OcmFault, Order, read_ocm_burns};
-use methods::Wired;
+pub(crate) use export::{Document, Missing, OcmBurn, OcmFault, Order, Unwritten, read_ocm_burns};
 pub(crate) use methods::{
-    Artifact, Candidate, PlanVerdict, Planning, Problem, Shard, SolverWork, State, Step,
-    VerdictKind,
+    Artifact, Candidate, InTime, PlanVerdict, Planning, Problem, Shard, SolverWork, State, Step,
+    Unread, Unverified, VerdictKind,
 };
+use methods::{Wired, same_for_every_method};
 pub(crate) use operations::{
     ERROR_DOMAIN, Failure, NamedBy, NoArtifact, OperationAnswer, OperationFilter, OperationName,
     OperationOutcome, OperationsAnswer, OperationsCall, PrecomputeCall, Progress, Standing,
@@ -71,6 +78,8 @@ pub struct Limits {
     pub sampled_rows_max: usize,
     /// Most vertices of an uncertain plant.
     pub plant_vertices_max: usize,
+    /// Most memory that a problem may take, as estimated from its dimensions.
+    pub problem_bytes_max: usize,
 }
 
 impl Default for Limits {
@@ -88,6 +97,7 @@ impl Default for Limits {
             report_states_max: 2000,
             sampled_rows_max: 2_000_000,
             plant_vertices_max: 64,
+            problem_bytes_max: 1 << 30,
         }
     }
 }

@@ -83,6 +83,7 @@ pub(crate) fn problem_again(message: &[u8], limits: &Limits) -> Result<Problem, 
 mod rpc_code {
     pub(super) const CANCELLED: i32 = 1;
     pub(super) const INVALID_ARGUMENT: i32 = 3;
+    pub(super) const UNAVAILABLE: i32 = 14;
 }
 
 /// Why an operation ended without a response.
@@ -113,6 +114,11 @@ impl Failure {
     /// Whether the problem itself is at fault.
     pub(crate) fn is_invalid_problem(&self) -> bool {
         self.code == rpc_code::INVALID_ARGUMENT
+    }
+
+    /// Whether it comes of something that does not answer now and may later.
+    pub(crate) fn is_unavailable(&self) -> bool {
+        self.code == rpc_code::UNAVAILABLE
     }
 }
 

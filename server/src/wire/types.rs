@@ -12,7 +12,7 @@ use vbar_guidance::{
 };
 use vbar_proto::v1;
 
-use super::{Door, Parse, Path, Render, count};
+use super::{Door, Parse, Path, Render, build::BUILD, count};
 
 /// Numbers beyond this are refused everywhere: no mission needs them, and products of a few of
 /// them would overflow.
@@ -75,9 +75,6 @@ pub(crate) struct Provenance {
     pub(crate) content_sha256: String,
 }
 
-/// Version of this program.
-pub(crate) const BUILD_VERSION: &str = env!("CARGO_PKG_VERSION");
-
 impl Render for Provenance {
     type Message = v1::Provenance;
 
@@ -87,7 +84,7 @@ impl Render for Provenance {
             method_version: self.method_version.to_owned(),
             artifact_id: self.artifact_id.clone(),
             content_sha256: self.content_sha256.clone(),
-            build_version: BUILD_VERSION.to_owned(),
+            build_version: BUILD.version.to_owned(),
         }
     }
 }

@@ -21,6 +21,7 @@ use super::verdict::{
 use crate::wire::{
     Planning, SolverWork, VerdictKind, Wired, count,
     orbits::{calendar_after, components},
+    same_for_every_method,
     types::{
         ElapsedAndState, MeasuredState, Units, render_certificate, render_infeasible,
         render_vectors,
@@ -32,25 +33,11 @@ impl Wired for AbortSafe {
     const PLANNING: Planning = Planning::Stepwise;
     const SEES_FAILURES: bool = true;
 
-    fn canonical_bytes(problem: &Problem) -> Vec<u8> {
-        problem.canonical_bytes()
-    }
+    same_for_every_method!();
 
     /// Half-spaces of reachable sets are in parts of a gauge, forces in parts of a thruster's.
     fn units(_: &Problem) -> Units {
         Units::scaled(None)
-    }
-
-    fn problem(artifact: &Artifact) -> &Problem {
-        artifact.problem()
-    }
-
-    fn artifact_to_bytes(artifact: &Artifact) -> Vec<u8> {
-        artifact.to_bytes()
-    }
-
-    fn artifact_from_bytes(bytes: &[u8]) -> Result<Artifact, String> {
-        Artifact::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
     fn render_summary(artifact: &Artifact) -> v1::artifact::Summary {
@@ -59,18 +46,6 @@ impl Wired for AbortSafe {
 
     fn as_abort_safe(artifact: &Artifact) -> Option<&Artifact> {
         Some(artifact)
-    }
-
-    fn step_index(state: &method::State) -> usize {
-        state.step_index()
-    }
-
-    fn state_to_bytes(state: &method::State) -> Vec<u8> {
-        state.to_bytes()
-    }
-
-    fn state_from_bytes(bytes: &[u8]) -> Result<method::State, String> {
-        method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
     fn measurement(
@@ -89,10 +64,6 @@ impl Wired for AbortSafe {
         }
     }
 
-    fn next(step: &Step) -> &method::State {
-        &step.next
-    }
-
     fn kind(step: &Step) -> VerdictKind {
         match step.verdict {
             Verdict::Command(_) => VerdictKind::Command,
@@ -100,10 +71,6 @@ impl Wired for AbortSafe {
             Verdict::Arrived(_) => VerdictKind::Arrived,
             Verdict::Infeasible(_) => VerdictKind::Infeasible,
         }
-    }
-
-    fn certificate(step: &Step) -> Option<&Certificate> {
-        step.certificate.as_ref()
     }
 
     fn work(step: &Step) -> SolverWork {

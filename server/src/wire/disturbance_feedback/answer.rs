@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 use vbar_guidance::{
     Budget, Method,
     control::{
-        Certificate, Fault, StepError,
+        Certificate, Fault, PrepareError, StepError,
         disturbance_feedback::{
             self as method, BurnCommand, Diagnostics, DisturbanceFeedback, Plan, Step, Verdict,
         },
@@ -18,8 +18,9 @@ use super::{
     plan::{render_plan, wrapped},
 };
 use crate::wire::{
-    PlanVerdict, Planning, SolverWork, VerdictKind, Wired, count,
+    InTime, PlanVerdict, Planning, SolverWork, VerdictKind, Wired, count,
     orbits::{calendar_after, components},
+    same_for_every_method,
     types::{ElapsedAndState, MeasuredState, Units, render_certificate, render_vectors},
 };
 
@@ -27,24 +28,18 @@ impl Wired for DisturbanceFeedback {
     const METHOD: Method = Method::DisturbanceFeedback;
     const PLANNING: Planning = Planning::IsArtifact;
 
-    fn canonical_bytes(problem: &method::Problem) -> Vec<u8> {
-        problem.canonical_bytes()
-    }
+    same_for_every_method!();
 
     fn units(problem: &method::Problem) -> Units {
         Units::impulses(problem.delta_v_max_m_s)
     }
 
-    fn problem(plan: &Plan) -> &method::Problem {
-        plan.problem()
-    }
-
-    fn artifact_to_bytes(plan: &Plan) -> Vec<u8> {
-        plan.to_bytes()
-    }
-
-    fn artifact_from_bytes(bytes: &[u8]) -> Result<Plan, String> {
-        Plan::from_bytes(bytes).map_err(|fault| fault.to_string())
+    fn prepare_in_time(
+        problem: &method::Problem,
+        budget: Budget<'_>,
+    ) -> Result<InTime<Plan>, PrepareError> {
+        let method::Designed { plan, is_cut_short } = method::design(problem, budget)?;
+        Ok(InTime { artifact: plan, is_cut_short })
     }
 
     fn render_summary(plan: &Plan) -> v1::artifact::Summary {
@@ -54,18 +49,6 @@ impl Wired for DisturbanceFeedback {
 
     fn as_plan(plan: &Plan) -> Option<&Plan> {
         Some(plan)
-    }
-
-    fn step_index(state: &method::State) -> usize {
-        state.step_index()
-    }
-
-    fn state_to_bytes(state: &method::State) -> Vec<u8> {
-        state.to_bytes()
-    }
-
-    fn state_from_bytes(bytes: &[u8]) -> Result<method::State, String> {
-        method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
     fn measurement(_: &Plan, measured: &ElapsedAndState) -> Result<method::Measurement, Fault> {
@@ -79,19 +62,11 @@ impl Wired for DisturbanceFeedback {
         }
     }
 
-    fn next(step: &Step) -> &method::State {
-        &step.next
-    }
-
     fn kind(step: &Step) -> VerdictKind {
         match step.verdict {
             Verdict::Burn(_) => VerdictKind::Command,
             Verdict::Arrived(_) => VerdictKind::Arrived,
         }
-    }
-
-    fn certificate(step: &Step) -> Option<&Certificate> {
-        step.certificate.as_ref()
     }
 
     /// Flying a plan solves nothing.

@@ -2,8 +2,9 @@
 
 use nalgebra::{DMatrix, Vector3};
 use vbar_guidance::{
+    Budget,
     control::{
-        Claim, Fault,
+        Claim, Failure, Fault, PrepareError,
         disturbance_feedback::{
             ArrivalSet, BurnBounds, Gain, Origin, Outcome, Plan, PlanCertificate, PlannedState,
             Problem,
@@ -15,7 +16,7 @@ use vbar_proto::v1;
 
 use super::{in_lvlh, plan::burn_epoch};
 use crate::wire::{
-    Door, Parse, Path, Violation, Violations,
+    Door, Parse, Path, Unverified, Violation, Violations,
     types::{Axes, Size, finite, integer, list, matrix, relative_state, unknown_enum, vector3},
 };
 
@@ -66,11 +67,16 @@ impl Claimed {
     /// The plan, if everything it claims holds.
     ///
     /// # Errors
-    /// Every claim that does not, with what follows from mission, burns and gains instead.
-    pub(crate) fn verify(self) -> Result<Plan, Violations> {
+    /// Every claim that does not, with what follows from mission, burns and gains instead; the
+    /// interruption of the budget.
+    pub(crate) fn verify(self, budget: Budget<'_>) -> Result<Plan, Unverified> {
         let Self { problem, burns, gains, origin, outcome, epochs, root } = self;
-        let plan = Plan::from_burns_and_gains(problem, burns, gains, origin)
-            .map_err(|faults| violations(&root, faults))?;
+        let plan = Plan::from_burns_and_gains_within(problem, burns, gains, origin, budget);
+        let plan = plan.map_err(|error| match error {
+            PrepareError::Failure(Failure::Interrupted(why)) => Unverified::Interrupted(why),
+            PrepareError::Faults(faults) => violations(&root, faults).into(),
+            other => unreachable!("a plan is right, or has faults: {other:?}"),
+        })?;
         let mut faults = plan.disagreements(&outcome);
         faults.extend(shares_that_differ(plan.outcome(), &outcome));
         let start = plan.problem().epoch.as_ref();
@@ -81,7 +87,7 @@ impl Claimed {
                 faults.push(Fault::new(field, format!("{expected:?}"), format!("{claimed:?}")));
             }
         }
-        if faults.is_empty() { Ok(plan) } else { Err(violations(&root, faults)) }
+        if faults.is_empty() { Ok(plan) } else { Err(violations(&root, faults).into()) }
     }
 }
 

@@ -7,7 +7,9 @@ mod ocm;
 mod oem;
 
 use bytes::Bytes;
-use vbar_guidance::{control::disturbance_feedback::Plan, epoch::Epoch, units::Seconds};
+use vbar_guidance::{
+    Budget, Interruption, control::disturbance_feedback::Plan, epoch::Epoch, units::Seconds,
+};
 use vbar_proto::v1;
 
 use super::{
@@ -56,14 +58,41 @@ pub(crate) struct Document {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Missing(pub(crate) Vec<&'static str>);
 
+/// Why no document is written.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Unwritten {
+    /// What the mission lacks.
+    Lacks(Missing),
+    /// Stopped from outside.
+    Interrupted(Interruption),
+}
+
+impl From<Missing> for Unwritten {
+    fn from(missing: Missing) -> Self {
+        Self::Lacks(missing)
+    }
+}
+
+impl From<Interruption> for Unwritten {
+    fn from(interruption: Interruption) -> Self {
+        Self::Interrupted(interruption)
+    }
+}
+
 /// Writes `plan`, which is called `plan_id`.
 ///
 /// # Errors
-/// [`Missing`].
-pub(crate) fn export(plan: &Plan, plan_id: &str, order: &Order) -> Result<Document, Missing> {
+/// [`Unwritten`].
+pub(crate) fn export(
+    plan: &Plan,
+    plan_id: &str,
+    order: &Order,
+    budget: Budget<'_>,
+) -> Result<Document, Unwritten> {
+    budget.check()?;
     let (content, content_type, extension) = match order.format {
         Format::Ocm => (ocm::write(plan, plan_id, &order.labels)?.into(), TEXT, "ocm"),
-        Format::Oem => (oem::write(plan, plan_id, &order.labels)?.into(), TEXT, "oem"),
+        Format::Oem => (oem::write(plan, plan_id, &order.labels, budget)?.into(), TEXT, "oem"),
         Format::Csv => (csv::write(plan).into(), "text/csv; charset=utf-8", "csv"),
         // `proto/UPLINK.md` has it byte by byte; its sha256 is the plan's id.
         Format::Binary => (plan.to_bytes().into(), "application/octet-stream", "bin"),

@@ -6,6 +6,7 @@
 
 use nalgebra::{DMatrix, Matrix3, Vector3};
 use vbar_guidance::{
+    Budget, Interruption,
     control::disturbance_feedback::{Coast, Plan},
     epoch::Epoch,
     frames::RTN_FROM_LVLH_CCSDS,
@@ -13,7 +14,7 @@ use vbar_guidance::{
     units::Seconds,
 };
 
-use super::{EPOCH, Labels, Missing, ORIENTATION, calendar_after, real};
+use super::{EPOCH, Labels, Missing, ORIENTATION, Unwritten, calendar_after, real};
 use crate::wire::orbits::{ccsds_frame, ccsds_time_system};
 
 /// Largest angle that the target turns between two states, at its fastest: interpolation of degree
@@ -36,7 +37,12 @@ struct Point {
 }
 
 /// Writes the ephemeris.
-pub(super) fn write(plan: &Plan, plan_id: &str, labels: &Labels) -> Result<String, Missing> {
+pub(super) fn write(
+    plan: &Plan,
+    plan_id: &str,
+    labels: &Labels,
+    budget: Budget<'_>,
+) -> Result<String, Unwritten> {
     let problem = plan.problem();
     let (Some(epoch), Some(orientation)) = (&problem.epoch, problem.orbit.orientation()) else {
         let mut missing = Vec::new();
@@ -46,7 +52,7 @@ pub(super) fn write(plan: &Plan, plan_id: &str, labels: &Labels) -> Result<Strin
         if problem.orbit.orientation().is_none() {
             missing.extend(ORIENTATION);
         }
-        return Err(Missing(missing));
+        return Err(Missing(missing).into());
     };
     let mut lines = vec![
         "CCSDS_OEM_VERS = 2.0".to_owned(),
@@ -58,7 +64,7 @@ pub(super) fn write(plan: &Plan, plan_id: &str, labels: &Labels) -> Result<Strin
     let frame = ccsds_frame(orientation.axes);
     let arcs = plan.burns().len();
     for coast in (0..arcs).filter_map(|k| plan.coast(k)) {
-        let points = points(&problem.orbit, &coast, STATES_MAX / arcs);
+        let points = points(&problem.orbit, &coast, STATES_MAX / arcs, budget)?;
         segment(&mut lines, &points, epoch, frame, labels);
     }
     Ok(lines.join("\n") + "\n")
@@ -110,7 +116,12 @@ fn segment(lines: &mut Vec<String>, points: &[Point], epoch: &Epoch, frame: &str
 }
 
 /// States from just after the burn to just before the next one.
-fn points(orbit: &KeplerOrbit, coast: &Coast, most: usize) -> Vec<Point> {
+fn points(
+    orbit: &KeplerOrbit,
+    coast: &Coast,
+    most: usize,
+    budget: Budget<'_>,
+) -> Result<Vec<Point>, Interruption> {
     let (start, stop) = (coast.start().seconds(), coast.end().seconds());
     let intervals = intervals(orbit, stop - start).min(most - 1);
     #[allow(clippy::cast_precision_loss, reason = "at most STATES_MAX")]
@@ -121,7 +132,12 @@ fn points(orbit: &KeplerOrbit, coast: &Coast, most: usize) -> Vec<Point> {
         _ if i == intervals => stop,
         _ => start + (stop - start) * share(i),
     };
-    (0..=intervals).filter_map(|i| point(orbit, coast, Seconds::from_seconds(elapsed(i)))).collect()
+    let mut points = Vec::with_capacity(intervals + 1);
+    for i in 0..=intervals {
+        budget.check()?;
+        points.extend(point(orbit, coast, Seconds::from_seconds(elapsed(i))));
+    }
+    Ok(points)
 }
 
 /// The chaser at `elapsed`; `None` only for an orbit without orientation, which the caller has

@@ -16,7 +16,7 @@ use vbar_guidance::{
 use vbar_proto::v1;
 
 use crate::wire::{
-    Planning, SolverWork, VerdictKind, Wired, count,
+    Planning, SolverWork, VerdictKind, Wired, count, same_for_every_method,
     types::{
         ElapsedAndState, MeasuredState, Units, render_certificate, render_infeasible,
         render_matrix, render_rows,
@@ -27,9 +27,7 @@ impl Wired for OfflineSampling {
     const METHOD: Method = Method::OfflineSampling;
     const PLANNING: Planning = Planning::Stepwise;
 
-    fn canonical_bytes(problem: &method::Problem) -> Vec<u8> {
-        problem.canonical_bytes()
-    }
+    same_for_every_method!();
 
     fn units(_: &method::Problem) -> Units {
         // Rows are over state and corrections together: their margins are no lengths.
@@ -40,32 +38,8 @@ impl Wired for OfflineSampling {
         method::check(problem, budget)
     }
 
-    fn problem(artifact: &Artifact) -> &method::Problem {
-        artifact.problem()
-    }
-
-    fn artifact_to_bytes(artifact: &Artifact) -> Vec<u8> {
-        artifact.to_bytes()
-    }
-
-    fn artifact_from_bytes(bytes: &[u8]) -> Result<Artifact, String> {
-        Artifact::from_bytes(bytes).map_err(|fault| fault.to_string())
-    }
-
     fn render_summary(artifact: &Artifact) -> v1::artifact::Summary {
         v1::artifact::Summary::OfflineSampling(render_artifact(artifact))
-    }
-
-    fn step_index(state: &method::State) -> usize {
-        state.step_index()
-    }
-
-    fn state_to_bytes(state: &method::State) -> Vec<u8> {
-        state.to_bytes()
-    }
-
-    fn state_from_bytes(bytes: &[u8]) -> Result<method::State, String> {
-        method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
     fn measurement(
@@ -91,19 +65,11 @@ impl Wired for OfflineSampling {
         Ok(method::Measurement { state, elapsed: measured.elapsed })
     }
 
-    fn next(step: &Step) -> &method::State {
-        &step.next
-    }
-
     fn kind(step: &Step) -> VerdictKind {
         match step.verdict {
             Verdict::Command(_) => VerdictKind::Command,
             Verdict::Infeasible(_) => VerdictKind::Infeasible,
         }
-    }
-
-    fn certificate(step: &Step) -> Option<&Certificate> {
-        step.certificate.as_ref()
     }
 
     /// The previous plan's tail is flown where no answer exists: it says so, and by how much its

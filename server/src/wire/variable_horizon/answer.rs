@@ -15,7 +15,7 @@ use vbar_guidance::{
 use vbar_proto::v1;
 
 use crate::wire::{
-    PlanVerdict, Planning, SolverWork, VerdictKind, Wired, count,
+    PlanVerdict, Planning, SolverWork, VerdictKind, Wired, count, same_for_every_method,
     types::{
         ElapsedAndState, MeasuredState, Units, render_certificate, render_infeasible,
         render_matrix, render_vectors,
@@ -26,40 +26,14 @@ impl Wired for VariableHorizon {
     const METHOD: Method = Method::VariableHorizon;
     const PLANNING: Planning = Planning::FromMeasurement;
 
-    fn canonical_bytes(problem: &method::Problem) -> Vec<u8> {
-        problem.canonical_bytes()
-    }
+    same_for_every_method!();
 
     fn units(problem: &method::Problem) -> Units {
         Units::scaled(position_unit_m(problem))
     }
 
-    fn problem(artifact: &method::Artifact) -> &method::Problem {
-        artifact.problem()
-    }
-
-    fn artifact_to_bytes(artifact: &method::Artifact) -> Vec<u8> {
-        artifact.to_bytes()
-    }
-
-    fn artifact_from_bytes(bytes: &[u8]) -> Result<method::Artifact, String> {
-        method::Artifact::from_bytes(bytes).map_err(|fault| fault.to_string())
-    }
-
     fn render_summary(artifact: &method::Artifact) -> v1::artifact::Summary {
         v1::artifact::Summary::VariableHorizon(render_artifact(artifact))
-    }
-
-    fn step_index(state: &method::State) -> usize {
-        state.step_index()
-    }
-
-    fn state_to_bytes(state: &method::State) -> Vec<u8> {
-        state.to_bytes()
-    }
-
-    fn state_from_bytes(bytes: &[u8]) -> Result<method::State, String> {
-        method::State::from_bytes(bytes).map_err(|fault| fault.to_string())
     }
 
     fn measurement(
@@ -69,20 +43,12 @@ impl Wired for VariableHorizon {
         Ok(measurement(measured))
     }
 
-    fn next(step: &Step) -> &method::State {
-        &step.next
-    }
-
     fn kind(step: &Step) -> VerdictKind {
         match step.verdict {
             Verdict::Command(_) => VerdictKind::Command,
             Verdict::Arrived(_) => VerdictKind::Arrived,
             Verdict::Infeasible(_) => VerdictKind::Infeasible,
         }
-    }
-
-    fn certificate(step: &Step) -> Option<&Certificate> {
-        step.certificate.as_ref()
     }
 
     fn work(step: &Step) -> SolverWork {
