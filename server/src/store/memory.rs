@@ -131,6 +131,10 @@ impl Store for MemoryStore {
         let (from, to) = ((ledger, [0; 32]), (ledger, [0xff; 32]));
         Ok(self.records().entries.range(from..=to).map(|((_, id), _)| *id).collect())
     }
+
+    fn reach(&self) -> Result<(), StoreError> {
+        Ok(())
+    }
 }
 
 #[cfg(test)]
