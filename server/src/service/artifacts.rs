@@ -6,6 +6,7 @@ use vbar_guidance::Budget;
 
 use super::{Call, Code, Error, Service};
 use crate::{
+    compute::Task,
     store::Shelf,
     wire::{
         ArtifactAnswer, ArtifactCall, ArtifactId, ArtifactsAnswer, ArtifactsCall, DownloadAnswer,
@@ -85,8 +86,9 @@ impl Service {
         call: &Call,
     ) -> Result<DownloadAnswer, Error> {
         let shelves = Arc::clone(&self.shelves);
-        let work = move |_: Budget<'_>| shelves.stored_with_bytes(Shelf::Artifacts, id);
-        let found = self.compute.run("download", call.deadline, work).await?.value?;
+        let work =
+            move |budget: Budget<'_>| shelves.stored_with_bytes(Shelf::Artifacts, id, budget);
+        let found = self.compute.run(Task::Download, &call.terms(), work).await?.value?;
         let Some((stored, bytes)) = found else {
             let message = format!("artifact {id} is not known; Precompute makes it");
             return Err(Error::new(Code::NotFound, "ARTIFACT_UNKNOWN", message));

@@ -8,10 +8,14 @@ use vbar_guidance::{
 };
 
 use crate::{
+    access::Refusal,
     compute::ComputeError,
     store::StoreError,
-    wire::{self, Missing, ReportFault, StateFault, Violation, Violations},
+    wire::{self, Missing, ReportFault, StateFault, Unverified, Unwritten, Violation, Violations},
 };
+
+/// There is no room in the store.
+pub(super) const STORE_FULL: &str = "STORE_FULL";
 
 /// The codes of `google.rpc.Code` that this service answers with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,6 +25,7 @@ pub(crate) enum Code {
     DeadlineExceeded,
     NotFound,
     AlreadyExists,
+    PermissionDenied,
     ResourceExhausted,
     FailedPrecondition,
     OutOfRange,
@@ -28,6 +33,7 @@ pub(crate) enum Code {
     Internal,
     Unavailable,
     DataLoss,
+    Unauthenticated,
 }
 
 impl Code {
@@ -39,6 +45,7 @@ impl Code {
             Self::DeadlineExceeded => 4,
             Self::NotFound => 5,
             Self::AlreadyExists => 6,
+            Self::PermissionDenied => 7,
             Self::ResourceExhausted => 8,
             Self::FailedPrecondition => 9,
             Self::OutOfRange => 11,
@@ -46,6 +53,7 @@ impl Code {
             Self::Internal => 13,
             Self::Unavailable => 14,
             Self::DataLoss => 15,
+            Self::Unauthenticated => 16,
         }
     }
 }
@@ -172,6 +180,24 @@ impl From<ReportFault> for Error {
     }
 }
 
+impl From<Unwritten> for Error {
+    fn from(unwritten: Unwritten) -> Self {
+        match unwritten {
+            Unwritten::Lacks(missing) => Self::missing(missing),
+            Unwritten::Interrupted(interruption) => Failure::from(interruption).into(),
+        }
+    }
+}
+
+impl From<Unverified> for Error {
+    fn from(unverified: Unverified) -> Self {
+        match unverified {
+            Unverified::Claims(violations) => violations.into(),
+            Unverified::Interrupted(interruption) => Failure::from(interruption).into(),
+        }
+    }
+}
+
 impl From<StateFault> for Error {
     fn from(fault: StateFault) -> Self {
         let message = format!("controller_state does not fit: {fault}");
@@ -187,6 +213,48 @@ impl From<Failure> for Error {
                 Self::new(Code::Cancelled, "CANCELLED", "the call was cancelled")
             }
             Failure::Numerical(what) => Self::internal("NUMERICAL_FAILURE", &what),
+        }
+    }
+}
+
+impl From<Refusal> for Error {
+    fn from(refusal: Refusal) -> Self {
+        let unauthenticated = |reason, message| Self::new(Code::Unauthenticated, reason, message);
+        let exhausted = |reason, message, retry_after| Self {
+            retry_after: Some(retry_after),
+            ..Self::new(Code::ResourceExhausted, reason, message)
+        };
+        match refusal {
+            Refusal::Missing => unauthenticated(
+                "CREDENTIAL_MISSING",
+                "say who asks: the header authorization: Bearer TOKEN, or a certificate",
+            ),
+            Refusal::Unreadable => unauthenticated(
+                "CREDENTIAL_UNREADABLE",
+                "the header authorization is not Bearer and one token",
+            ),
+            Refusal::Unknown => {
+                unauthenticated("CREDENTIAL_UNKNOWN", "this token or certificate is not known here")
+            }
+            Refusal::Expired => {
+                unauthenticated("CREDENTIAL_EXPIRED", "this token or certificate has expired")
+            }
+            Refusal::Role { caller, call, needs } => {
+                let needs = needs.name();
+                let message =
+                    format!("{call} needs the role {needs}, which {caller} does not have");
+                Self::new(Code::PermissionDenied, "ROLE_MISSING", message)
+            }
+            Refusal::Rate { retry_after } => exhausted(
+                "CALLER_RATE",
+                "too many requests of this caller; ask again after the time given",
+                retry_after,
+            ),
+            Refusal::Calls { retry_after } => exhausted(
+                "CALLER_CALLS",
+                "too many calls of this caller are under way; ask again after the time given",
+                retry_after,
+            ),
         }
     }
 }
@@ -221,12 +289,26 @@ impl From<StoreError> for Error {
                 Self::new(Code::DataLoss, "ARTIFACT_DAMAGED", fault.to_string())
             }
             StoreError::Full(_) => {
-                Self::new(Code::ResourceExhausted, "STORE_FULL", fault.to_string())
-            }
-            StoreError::Stale { .. } | StoreError::InUse(_) | StoreError::Io { .. } => {
+                /// Somebody must make room, or something must expire.
+                const RETRY_AFTER: Duration = Duration::from_secs(30);
                 tracing::error!(%fault, "store");
-                let message = "the artifact store does not answer";
-                Self::new(Code::Unavailable, "STORE_UNAVAILABLE", message)
+                Self {
+                    retry_after: Some(RETRY_AFTER),
+                    ..Self::new(Code::ResourceExhausted, STORE_FULL, fault.to_string())
+                }
+            }
+            StoreError::Stale { .. }
+            | StoreError::InUse(_)
+            | StoreError::Io { .. }
+            | StoreError::Unreachable(_) => {
+                const RETRY_AFTER: Duration = Duration::from_secs(2);
+                tracing::error!(%fault, "store");
+                let message = "the artifact store does not answer; steps with artifacts that this \
+                               node remembers still do";
+                Self {
+                    retry_after: Some(RETRY_AFTER),
+                    ..Self::new(Code::Unavailable, "STORE_UNAVAILABLE", message)
+                }
             }
         }
     }

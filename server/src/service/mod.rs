@@ -1,8 +1,13 @@
 //! The service: what each call means, whatever it came over.
 
+#[cfg(test)]
+mod aftermath;
 mod artifacts;
 mod cache;
+mod clock;
 mod error;
+#[cfg(test)]
+mod full_disk;
 mod jobs;
 mod leases;
 mod operations;
@@ -13,14 +18,14 @@ mod shelves;
 use std::{
     io,
     sync::Arc,
-    time::{Duration, Instant, SystemTime},
+    time::{Duration, Instant},
 };
 
 use bytes::Bytes;
 use tokio::sync::Semaphore;
 use vbar_guidance::{
     Budget, Method,
-    control::{Certificate, PrepareError, StepError},
+    control::{Certificate, Claim, PrepareError, StepError},
 };
 
 pub(crate) use crate::compute::Timed;
@@ -28,23 +33,31 @@ pub(crate) use error::{Code, Error};
 pub(crate) use session::{Session, SessionAnswer};
 
 pub(crate) use artifacts::Range;
+#[cfg(feature = "fuzzing")]
+pub(crate) use jobs::stored as stored_jobs;
+#[cfg(feature = "fuzzing")]
+pub(crate) use leases::rewritten as lease_rewritten;
 pub(crate) use operations::Watching;
+#[cfg(feature = "fuzzing")]
+pub(crate) use record::{decode as decode_record, encode as encode_record};
 
 use crate::{
-    compute::Compute,
+    access::Caller,
+    compute::{Compute, Task, Terms},
     config::Config,
-    store::{Shelf, Store},
-    telemetry::{Metrics, OutcomeLabels},
+    store::{Shared, Shelf, Store, StoreError},
+    telemetry::{ClaimLabels, Metrics, OutcomeLabels},
     wire::{
         Artifact, ArtifactId, Controller, ControllerState, DecidedStep, Document, ElapsedAndState,
-        ExportCall, InfoAnswer, InfoCall, KeptPlanAnswer, KeptPlanCall, Limits, PlanAnswer,
+        ExportCall, InTime, InfoAnswer, InfoCall, KeptPlanAnswer, KeptPlanCall, Limits, PlanAnswer,
         PlanCall, PlanResult, PlanVerdict, PlansAnswer, PlansCall, Problem, ReportAnswer,
         ReportCall, SolverWork, State, StateFault, StepAnswer, StepCall, StoredArtifact,
         UploadAnswer, UploadCall, VerdictKind,
     },
 };
 use cache::{Cache, Outcome};
-use jobs::{JobLimits, Jobs};
+use clock::Clock;
+use jobs::{Fleet, JobLimits, Jobs, Single};
 use leases::Leases;
 use operations::Precompute;
 use session::StateSource;
@@ -54,6 +67,19 @@ use shelves::{Shelves, provenance};
 fn problem_path(method: Method) -> String {
     format!("problem.{}", method.name())
 }
+
+/// Whether a caller can use what is certified but not the problem's artifact, when time is short.
+///
+/// A plan can be flown whatever else its problem has. A step's controller state goes on to the next
+/// step, whose artifact must be the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Haste {
+    Welcome,
+    Refused,
+}
+
+/// In the count of artifacts: there was no time for one.
+const CUT_SHORT: &str = "cut_short";
 
 /// A decoded artifact with where it comes from.
 type Loaded = StoredArtifact;
@@ -65,13 +91,20 @@ enum Found {
 }
 
 /// What a call brings besides its message.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(crate) struct Call {
+    /// Who asks.
+    pub(crate) caller: Caller,
     /// When an answer is no longer of use.
     pub(crate) deadline: Instant,
 }
 
 impl Call {
+    /// What compute threads need to know of it.
+    fn terms(&self) -> Terms {
+        Terms { caller: Arc::clone(self.caller.name()), deadline: self.deadline }
+    }
+
     /// When to answer with what there is, so that it still arrives in time.
     fn answer_by(&self) -> Instant {
         let left = self.deadline.saturating_duration_since(Instant::now());
@@ -79,12 +112,21 @@ impl Call {
     }
 }
 
+/// A store that was opened.
+#[derive(Debug, Clone)]
+pub(crate) enum OpenStore {
+    /// This process has it for itself.
+    Own(Arc<dyn Store>),
+    /// Others use it too.
+    Shared(Arc<dyn Shared>),
+}
+
 /// The service.
 #[derive(Debug)]
 pub(crate) struct Service {
     compute: Compute,
     shelves: Arc<Shelves>,
-    jobs: Arc<Jobs<Precompute>>,
+    jobs: Arc<dyn Jobs<Precompute>>,
     watching: Arc<Semaphore>,
     precompute_wait: Duration,
     metrics: Arc<Metrics>,
@@ -99,16 +141,23 @@ impl Service {
     /// If the store cannot be read or the system gives no thread for jobs.
     pub(crate) fn open(
         compute: Compute,
-        store: Arc<dyn Store>,
+        store: OpenStore,
         config: &Config,
         metrics: Arc<Metrics>,
         info: InfoAnswer,
     ) -> io::Result<Self> {
+        let (term, bytes_max) = (config.artifact_lifetime, config.artifact_bytes_max);
+        let kept: Arc<dyn Store> = match &store {
+            OpenStore::Own(store) => Arc::clone(store),
+            OpenStore::Shared(store) => Arc::clone(store) as _,
+        };
+        let is_shared = matches!(store, OpenStore::Shared(_));
+        let clock = Arc::new(Clock::of_system());
         let leases =
-            Leases::open(Arc::clone(&store), config.artifact_lifetime, config.artifact_bytes_max)
+            Leases::open(Arc::clone(&kept), Arc::clone(&clock), term, bytes_max, is_shared)
                 .map_err(io::Error::other)?;
         let shelves = Arc::new(Shelves {
-            store: Arc::clone(&store),
+            store: kept,
             cache: Cache::new(config.cache_bytes_max),
             leases,
             metrics: Arc::clone(&metrics),
@@ -120,10 +169,17 @@ impl Service {
             attempts_max: config.job_attempts_max,
             kept_for: config.operation_lifetime,
         };
-        let jobs = Jobs::open(store, limits, Arc::clone(&metrics), |id, problem| {
-            Precompute::again(id, problem, &info.limits, &shelves)
-        })?;
-        let jobs = Arc::new(jobs);
+        let restore = {
+            let (limits, shelves) = (info.limits, Arc::clone(&shelves));
+            move |id, problem: &[u8]| Precompute::again(id, problem, &limits, &shelves)
+        };
+        let counts = Arc::clone(&metrics);
+        let jobs: Arc<dyn Jobs<Precompute>> = match store {
+            OpenStore::Own(store) => Arc::new(Single::open(store, clock, limits, counts, restore)?),
+            OpenStore::Shared(store) => {
+                Arc::new(Fleet::open(store, clock, limits, counts, Box::new(restore))?)
+            }
+        };
         let watching = Arc::new(Semaphore::new(config.watchers_max));
         let precompute_wait = config.precompute_wait;
         Ok(Self { compute, shelves, jobs, watching, precompute_wait, metrics, info })
@@ -131,19 +187,34 @@ impl Service {
 
     /// Writes down and removes what time has changed. Blocks on the store.
     pub(crate) fn sweep(&self) {
-        let now = SystemTime::now();
-        for id in self.shelves.leases.sweep(now) {
+        for id in self.shelves.leases.sweep() {
             self.shelves.cache.forget(&(Shelf::Artifacts, id));
             self.metrics.artifacts_expired.inc();
             tracing::info!(%id, "artifact expired");
         }
-        self.jobs.sweep(now);
+        self.jobs.sweep();
     }
 
     /// Hands back what jobs are at and lets nobody wait any longer. Blocks on the store, and on
     /// threads that are slow to stop for at most `grace`.
     pub(crate) fn stop(&self, grace: Duration) {
         self.jobs.stop(grace);
+    }
+
+    /// Why calls that need the store would not be answered, if they would not.
+    pub(crate) async fn store_fault(&self) -> Option<String> {
+        let store = Arc::clone(&self.shelves.store);
+        let reached = tokio::task::spawn_blocking(move || store.reach());
+        match reached.await {
+            Ok(Ok(())) => None,
+            // Whoever asks need not be known: paths are for the log.
+            Ok(Err(fault @ StoreError::Io { .. })) => {
+                tracing::error!(%fault, "store");
+                Some("the store cannot be written".to_owned())
+            }
+            Ok(Err(fault)) => Some(fault.to_string()),
+            Err(fault) => Some(fault.to_string()),
+        }
     }
 
     /// The limits in force.
@@ -203,7 +274,7 @@ impl Service {
         let Loaded { artifact, provenance, .. } = loaded;
         let work =
             move |budget: Budget<'_>| question.judge(artifact, plan.as_ref(), provenance, budget);
-        let timed = self.compute.run("safety_report", call.deadline, work).await?;
+        let timed = self.compute.run(Task::SafetyReport, &call.terms(), work).await?;
         Ok(Timed { value: timed.value?, compute: timed.compute })
     }
 
@@ -221,7 +292,7 @@ impl Service {
             return Ok(Timed { value, compute: timed.compute });
         }
         let (method, id) = (ask.problem.method(), record::problem_id(&ask.problem));
-        let loaded = match self.obtain(id, ask.problem, call).await? {
+        let loaded = match self.obtain(id, ask.problem, Haste::Welcome, call).await? {
             Outcome::Made(loaded) => loaded,
             Outcome::Infeasible(problem, why) => {
                 self.planned("infeasible");
@@ -237,10 +308,10 @@ impl Service {
             let verdict = artifact.plan(initial.as_ref(), budget);
             let verdict = verdict.map_err(|fault| Error::step("initial", fault))?;
             let sound = verdict.certificate.as_ref().is_none_or(|certificate| certificate.passed);
-            let kept = (sound && artifact.is_plan()).then(|| shelves.keep_plan(artifact));
+            let kept = (sound && artifact.is_plan()).then(|| shelves.keep_plan(&artifact, budget));
             Ok((verdict, kept.transpose()?))
         };
-        let timed = self.compute.run("plan", call.deadline, work).await?;
+        let timed = self.compute.run(Task::Plan.of(method), &call.terms(), work).await?;
         let (verdict, kept) = timed.value?;
         self.count(verdict.work);
         if let Some(certificate) = &verdict.certificate {
@@ -261,12 +332,12 @@ impl Service {
     ) -> Result<Timed<UploadAnswer>, Error> {
         let shelves = Arc::clone(&self.shelves);
         let UploadCall { candidate, validate_only } = ask;
-        let work = move |_: Budget<'_>| -> Result<(Artifact, Option<Loaded>), Error> {
-            let plan = candidate.verify()?;
-            let kept = (!validate_only).then(|| shelves.keep_plan(plan.clone()));
+        let work = move |budget: Budget<'_>| -> Result<(Artifact, Option<Loaded>), Error> {
+            let plan = candidate.verify_within(budget)?;
+            let kept = (!validate_only).then(|| shelves.keep_plan(&plan, budget));
             Ok((plan, kept.transpose()?))
         };
-        let timed = self.compute.run("verify", call.deadline, work).await?;
+        let timed = self.compute.run(Task::Verify, &call.terms(), work).await?;
         let (plan, kept) = timed.value.inspect_err(|_| self.planned("refused"))?;
         self.planned("uploaded");
         let plan_id = kept.map(|plan| self.shelves.remember(Shelf::Plans, plan).id);
@@ -304,14 +375,14 @@ impl Service {
     ) -> Result<Timed<Document>, Error> {
         let ExportCall { id, order } = ask;
         let plan = self.load(Shelf::Plans, id, call).await?.artifact;
-        let work = move |_: Budget<'_>| plan.export(&id.to_string(), &order);
-        let timed = self.compute.run("export", call.deadline, work).await?;
+        let work = move |budget: Budget<'_>| plan.export_within(&id.to_string(), &order, budget);
+        let timed = self.compute.run(Task::Export, &call.terms(), work).await?;
         match timed.value {
             Some(Ok(value)) => {
                 self.planned("exported");
                 Ok(Timed { value, compute: timed.compute })
             }
-            Some(Err(missing)) => Err(Error::missing(missing)),
+            Some(Err(unwritten)) => Err(unwritten.into()),
             None => Err(Error::internal("NOT_A_PLAN", &id.to_string())),
         }
     }
@@ -328,7 +399,7 @@ impl Service {
         let list = move |_: Budget<'_>| {
             shelves.store.list(shelf, after.as_ref().map(|id| &id.0), page_size + 1)
         };
-        let mut ids = self.compute.run("list", call.deadline, list).await?.value?;
+        let mut ids = self.compute.run(Task::List, &call.terms(), list).await?.value?;
         let more = ids.len() > page_size;
         ids.truncate(page_size);
         let next = ids.last().filter(|_| more).map(|id| ArtifactId(*id));
@@ -344,7 +415,7 @@ impl Service {
         omit_prediction: bool,
         call: &Call,
     ) -> Result<Timed<DecidedStep>, Error> {
-        let id = artifact.id;
+        let (id, method) = (artifact.id, artifact.artifact.method());
         let work = move |budget: Budget<'_>| -> Result<DecidedStep, Error> {
             let state = match state {
                 StateSource::Decoded(state) => *state,
@@ -356,7 +427,7 @@ impl Service {
             let provenance = artifact.provenance;
             Ok(DecidedStep { provenance, step, controller_state, omit_prediction })
         };
-        let timed = self.compute.run("step", call.deadline, work).await?;
+        let timed = self.compute.run(Task::Step.of(method), &call.terms(), work).await?;
         let answer = timed.value?;
         self.shelves.leases.extend(id);
         self.count(answer.step.work());
@@ -368,6 +439,10 @@ impl Service {
         };
         if answer.step.kind() == VerdictKind::Command {
             self.withhold_unless(answer.step.may_leave(), answer.step.certificate())?;
+        }
+        if let Some(certificate) = answer.step.certificate() {
+            let labels = ClaimLabels { claim: claim_name(certificate.claim) };
+            self.metrics.commands.get_or_create(&labels).inc();
         }
         self.metrics.verdicts.get_or_create(&OutcomeLabels { outcome }).inc();
         Ok(Timed { value: answer, compute: timed.compute })
@@ -382,7 +457,7 @@ impl Service {
             Controller::Plan(id) => self.load(Shelf::Plans, id, call).await.map(Found::Controller),
             Controller::Problem(problem) => {
                 let id = record::problem_id(&problem);
-                match self.obtain(id, problem, call).await? {
+                match self.obtain(id, problem, Haste::Refused, call).await? {
                     Outcome::Made(loaded) => Ok(Found::Controller(loaded)),
                     Outcome::Infeasible(problem, why) => {
                         let provenance = provenance(problem.method(), id, String::new());
@@ -401,14 +476,17 @@ impl Service {
             return Ok(loaded);
         }
         let shelves = Arc::clone(&self.shelves);
-        let work = move |_: Budget<'_>| shelves.stored(shelf, id);
-        let Some(loaded) = self.compute.run("load", call.deadline, work).await?.value? else {
+        let work = move |budget: Budget<'_>| shelves.stored(shelf, id, budget);
+        let Some(loaded) = self.compute.run(Task::Load, &call.terms(), work).await?.value? else {
             self.shelves.looked_up("unknown");
             let (reason, message) = match shelf {
                 Shelf::Artifacts => {
                     ("ARTIFACT_UNKNOWN", format!("artifact {id} is not known; Precompute makes it"))
                 }
                 Shelf::Plans => ("PLAN_UNKNOWN", format!("plan {id} is not kept here")),
+                Shelf::Problems | Shelf::Shards => {
+                    ("RECORD_UNKNOWN", format!("{id} is not among {}", shelf.name()))
+                }
             };
             return Err(Error::new(Code::NotFound, reason, message));
         };
@@ -422,33 +500,53 @@ impl Service {
         &self,
         id: ArtifactId,
         problem: Problem,
+        haste: Haste,
         call: &Call,
     ) -> Result<Outcome, Error> {
-        let key = (Shelf::Artifacts, id);
+        let (key, method) = ((Shelf::Artifacts, id), problem.method());
         if let Some(outcome) = self.shelves.cache.get(&key) {
             self.shelves.looked_up("hit");
             return Ok(outcome);
         }
         let shelves = Arc::clone(&self.shelves);
         let work = move |budget: Budget<'_>| -> Result<(Outcome, &'static str), Error> {
-            if let Some(loaded) = shelves.stored(Shelf::Artifacts, id)? {
+            if let Some(loaded) = shelves.stored(Shelf::Artifacts, id, budget)? {
                 return Ok((Outcome::Made(loaded), "loaded"));
             }
-            let artifact = match problem.prepare(budget) {
-                Ok(artifact) => artifact,
-                Err(PrepareError::Infeasible(why)) => {
-                    return Ok((Outcome::Infeasible(problem, Arc::new(why)), "computed"));
-                }
-                Err(fault) => {
-                    return Err(Error::prepare(&problem_path(problem.method()), fault));
+            let prepared = match haste {
+                Haste::Welcome => problem.prepare_in_time(budget),
+                Haste::Refused => {
+                    problem.prepare(budget).map(|artifact| InTime { artifact, is_cut_short: false })
                 }
             };
-            shelves.keep(id, artifact).map(|loaded| (Outcome::Made(loaded), "computed"))
+            match prepared {
+                Ok(InTime { artifact, is_cut_short: false }) => {
+                    match shelves.keep(id, &artifact, budget) {
+                        // No step waits for somebody to make room; the node's memory keeps it
+                        // meanwhile.
+                        Err(Error { reason: error::STORE_FULL, .. }) => {
+                            let loaded = shelves::unkept(id, &artifact, budget)?;
+                            Ok((Outcome::Made(loaded), "unkept"))
+                        }
+                        kept => kept.map(|loaded| (Outcome::Made(loaded), "computed")),
+                    }
+                }
+                Ok(InTime { artifact, is_cut_short: true }) => {
+                    let unkept = shelves::unkept(id, &artifact, budget);
+                    unkept.map(|loaded| (Outcome::Made(loaded), CUT_SHORT))
+                }
+                Err(PrepareError::Infeasible(why)) => {
+                    Ok((Outcome::Infeasible(problem, Arc::new(why)), "computed"))
+                }
+                Err(fault) => Err(Error::prepare(&problem_path(problem.method()), fault)),
+            }
         };
-        let timed = self.compute.run("precompute", call.deadline, work).await?;
+        let timed = self.compute.run(Task::Precompute.of(method), &call.terms(), work).await?;
         let (outcome, source) = timed.value?;
         self.shelves.looked_up(source);
-        self.shelves.cache.insert(key, outcome.clone());
+        if source != CUT_SHORT {
+            self.shelves.cache.insert(key, outcome.clone());
+        }
         Ok(outcome)
     }
 
@@ -468,7 +566,7 @@ impl Service {
             Ok(()) | Err(PrepareError::Infeasible(_)) => Ok(()),
             Err(fault) => Err(Error::prepare(&problem_path(method), fault)),
         };
-        let timed = self.compute.run("validate", call.deadline, work).await?;
+        let timed = self.compute.run(Task::Validate.of(method), &call.terms(), work).await?;
         timed.value?;
         Ok(Timed { value: (id, method), compute: timed.compute })
     }
@@ -495,6 +593,18 @@ impl Service {
 
     fn planned(&self, outcome: &'static str) {
         self.metrics.plans.get_or_create(&OutcomeLabels { outcome }).inc();
+    }
+}
+
+/// In the count of commands.
+fn claim_name(claim: Claim) -> &'static str {
+    match claim {
+        Claim::Global => "global",
+        Claim::GlobalToHorizonMax => "global_to_horizon_max",
+        Claim::LocalInHorizon => "local_in_horizon",
+        Claim::FixedHorizon => "fixed_horizon",
+        Claim::Feasible => "feasible",
+        Claim::PreviousPlanTail => "previous_plan_tail",
     }
 }
 

@@ -15,10 +15,12 @@ use super::{
     shelves::Shelves,
 };
 use crate::{
-    store::Shelf,
+    access::Caller,
+    compute::Task,
+    store::{Shelf, StoreError},
     wire::{
         self, ArtifactId, Failure, Limits, NoArtifact, OperationAnswer, OperationName,
-        OperationOutcome, OperationsAnswer, OperationsCall, PrecomputeCall, Problem, Shard,
+        OperationOutcome, OperationsAnswer, OperationsCall, PrecomputeCall, Problem, Shard, Unread,
         WaitCall, problem_again,
     },
 };
@@ -73,8 +75,8 @@ impl Work for Precompute {
         self.problem.method().name()
     }
 
-    fn is_made(&self) -> bool {
-        self.shelves.leases.expires(self.id).is_some()
+    fn is_made(&self) -> Result<bool, StoreError> {
+        self.shelves.leases.is_kept(self.id)
     }
 
     fn shards(&self) -> usize {
@@ -85,9 +87,17 @@ impl Work for Precompute {
         self.problem.run_shard(shard, budget).map_err(|fault| self.stopped(fault))
     }
 
+    fn shard_to_bytes(&self, shard: &Shard) -> Vec<u8> {
+        self.problem.shard_to_bytes(shard)
+    }
+
+    fn shard_from_bytes(&self, bytes: &[u8], budget: Budget<'_>) -> Result<Shard, Unread> {
+        self.problem.shard_from_bytes_within(bytes, budget)
+    }
+
     fn finish(&self, shards: Vec<Shard>, budget: Budget<'_>) -> Result<(), Stopped> {
         let artifact = self.problem.merge(shards, budget).map_err(|fault| self.stopped(fault))?;
-        let kept = self.shelves.keep(self.id, artifact);
+        let kept = self.shelves.keep(self.id, &artifact, budget);
         let kept = kept.map_err(|error| Stopped::Failed(error.into()))?;
         self.shelves.looked_up("computed");
         self.shelves.remember(Shelf::Artifacts, kept);
@@ -99,6 +109,7 @@ impl Work for Precompute {
 #[derive(Debug)]
 pub(crate) struct Watching {
     service: Arc<Service>,
+    caller: Caller,
     id: ArtifactId,
     changes: watch::Receiver<()>,
     is_over: bool,
@@ -128,7 +139,8 @@ impl Watching {
                 () = self.service.jobs.closed() => return None,
             }
         }
-        let call = Call { deadline: self.service.deadline(None) };
+        let deadline = self.service.deadline(None);
+        let call = Call { caller: self.caller.clone(), deadline };
         let answer = match self.service.jobs.watch(self.id) {
             Ok((view, changes)) => {
                 self.changes = changes;
@@ -156,16 +168,18 @@ impl Service {
         }
         let id = record::problem_id(&problem);
         let work = Precompute { id, problem, shelves: Arc::clone(&self.shelves) };
-        if work.is_made() {
-            self.shelves.leases.extend(id);
-        } else {
-            // Better told now than after hours of work.
-            self.shelves.leases.admit(0)?;
-        }
-        let order = Order { id, work, problem: message, request_id };
-        let jobs = Arc::clone(&self.jobs);
-        let submit = move |_: Budget<'_>| jobs.submit(order);
-        self.compute.run("submit", call.deadline, submit).await?.value?;
+        let (jobs, shelves) = (Arc::clone(&self.jobs), Arc::clone(&self.shelves));
+        let submit = move |_: Budget<'_>| {
+            let is_made = work.is_made()?;
+            if is_made {
+                shelves.leases.extend(id);
+            } else {
+                // Better told now than after hours of work.
+                shelves.leases.admit(0)?;
+            }
+            jobs.submit(Order { id, work, problem: message, request_id, is_made })
+        };
+        self.compute.run(Task::Submit, &call.terms(), submit).await?.value?;
         let until = call.answer_by().min(Instant::now() + self.precompute_wait);
         let view = self.jobs.wait(id, until).await?;
         if let Some(Ending::Failed(failure)) = &view.ending
@@ -186,7 +200,7 @@ impl Service {
         let jobs = Arc::clone(&self.jobs);
         let forget = move |_: Budget<'_>| jobs.delete(id);
         // Somebody else may have been faster, or have asked once more.
-        let _ = self.compute.run("forget", call.deadline, forget).await?;
+        let _ = self.compute.run(Task::Forget, &call.terms(), forget).await?;
         Err(Error {
             violations: failure.violations,
             ..Error::new(Code::InvalidArgument, "INVALID_REQUEST", failure.message)
@@ -199,7 +213,18 @@ impl Service {
         ask: OperationName,
         call: &Call,
     ) -> Result<OperationAnswer, Error> {
+        self.find(ask.id, call).await?;
         self.operation_answer(self.jobs.view(ask.id)?, call).await
+    }
+
+    /// Another node may have taken the order a moment ago.
+    async fn find(&self, id: ArtifactId, call: &Call) -> Result<(), Error> {
+        if self.jobs.view(id).is_ok() {
+            return Ok(());
+        }
+        let jobs = Arc::clone(&self.jobs);
+        let find = move |_: Budget<'_>| jobs.find(id);
+        self.compute.run(Task::Load, &call.terms(), find).await?.value
     }
 
     /// `WaitOperation`: answers when it is done, at its timeout or a little before the call's
@@ -216,6 +241,7 @@ impl Service {
                 Instant::now().checked_add(timeout).map_or(until, |end| end.min(until))
             }
         };
+        self.find(ask.operation.id, call).await?;
         let view = self.jobs.wait(ask.operation.id, until).await?;
         self.operation_answer(view, call).await
     }
@@ -245,7 +271,7 @@ impl Service {
     ) -> Result<(), Error> {
         let jobs = Arc::clone(&self.jobs);
         let cancel = move |_: Budget<'_>| jobs.cancel(ask.id);
-        self.compute.run("cancel", call.deadline, cancel).await?.value
+        self.compute.run(Task::Cancel, &call.terms(), cancel).await?.value
     }
 
     /// `DeleteOperation`: forgets a finished one; its artifact stays until it expires.
@@ -256,15 +282,20 @@ impl Service {
     ) -> Result<(), Error> {
         let jobs = Arc::clone(&self.jobs);
         let delete = move |_: Budget<'_>| jobs.delete(ask.id);
-        self.compute.run("delete", call.deadline, delete).await?.value
+        self.compute.run(Task::Delete, &call.terms(), delete).await?.value
     }
 
     /// Follows an operation as it goes on.
     ///
     /// # Errors
     /// `NOT_FOUND`; `RESOURCE_EXHAUSTED` if too many are watching.
-    pub(crate) fn watch_operation(self: &Arc<Self>, ask: OperationName) -> Result<Watching, Error> {
+    pub(crate) async fn watch_operation(
+        self: &Arc<Self>,
+        ask: OperationName,
+        call: Call,
+    ) -> Result<Watching, Error> {
         const RETRY_AFTER: Duration = Duration::from_secs(10);
+        self.find(ask.id, &call).await?;
         let (_, changes) = self.jobs.watch(ask.id)?;
         let place = Arc::clone(&self.watching).try_acquire_owned().map_err(|_| {
             let message = "too many callers watch operations; WaitOperation is there for all";
@@ -273,8 +304,8 @@ impl Service {
                 ..Error::new(Code::ResourceExhausted, "WATCHERS_FULL", message)
             }
         })?;
-        let service = Arc::clone(self);
-        Ok(Watching { service, id: ask.id, changes, is_over: false, _place: place })
+        let (service, caller) = (Arc::clone(self), call.caller);
+        Ok(Watching { service, caller, id: ask.id, changes, is_over: false, _place: place })
     }
 
     /// A job as callers see it, with the artifact if that is what came of it.

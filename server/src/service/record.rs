@@ -8,11 +8,11 @@
 //! problem inside it has that digest. A plan is found by the digest of its own bytes.
 
 use sha2::{Digest, Sha256};
-use vbar_guidance::Method;
+use vbar_guidance::{Budget, Method};
 
 use crate::{
     store::Shelf,
-    wire::{Artifact, ArtifactId, Problem},
+    wire::{Artifact, ArtifactId, Problem, Unread},
 };
 
 const MAGIC: &[u8; 4] = b"VBAR";
@@ -44,7 +44,7 @@ pub(super) fn content_id(bytes: &[u8]) -> ArtifactId {
 }
 
 /// The record of an artifact whose own bytes are `bytes`.
-pub(super) fn encode(method: Method, bytes: &[u8]) -> Vec<u8> {
+pub(crate) fn encode(method: Method, bytes: &[u8]) -> Vec<u8> {
     let mut record = Vec::with_capacity(bytes.len() + 64);
     record.extend_from_slice(MAGIC);
     record.push(FORMAT_VERSION);
@@ -56,12 +56,34 @@ pub(super) fn encode(method: Method, bytes: &[u8]) -> Vec<u8> {
     record
 }
 
-/// The artifact in a record, checked again, and its own bytes.
-pub(super) fn decode(
+/// The artifact in a record, checked again however long that takes, and its own bytes.
+#[cfg(any(test, feature = "fuzzing"))]
+pub(crate) fn decode(
     shelf: Shelf,
     id: ArtifactId,
     record: &[u8],
 ) -> Result<(Artifact, &[u8]), String> {
+    decode_within(shelf, id, record, Budget::UNLIMITED).map_err(|unread| match unread {
+        Unread::Damaged(what) => what,
+        Unread::Interrupted(why) => unreachable!("an unlimited budget said {why:?}"),
+    })
+}
+
+/// The same, if there is time.
+pub(crate) fn decode_within<'a>(
+    shelf: Shelf,
+    id: ArtifactId,
+    record: &'a [u8],
+    budget: Budget<'_>,
+) -> Result<(Artifact, &'a [u8]), Unread> {
+    let (method, rest) = of_method(record).map_err(Unread::Damaged)?;
+    let artifact = Artifact::from_bytes_within(method, rest, budget)?;
+    check_name(shelf, id, &artifact, rest).map_err(Unread::Damaged)?;
+    Ok((artifact, rest))
+}
+
+/// The method of a record, and the artifact's own bytes.
+fn of_method(record: &[u8]) -> Result<(Method, &[u8]), String> {
     let rest = record.strip_prefix(MAGIC).ok_or("it is not an artifact's record")?;
     let (version, mut rest) = rest.split_first().ok_or("it is truncated")?;
     if *version != FORMAT_VERSION {
@@ -79,22 +101,34 @@ pub(super) fn decode(
             method.version()
         ));
     }
-    let artifact = Artifact::from_bytes(method, rest)?;
+    Ok((method, rest))
+}
+
+/// Refuses an artifact that stands under another's name.
+fn check_name(
+    shelf: Shelf,
+    id: ArtifactId,
+    artifact: &Artifact,
+    bytes: &[u8],
+) -> Result<(), String> {
     match shelf {
         Shelf::Artifacts => {
-            let found = artifact_id(method, &artifact.canonical_problem());
+            let found = artifact_id(artifact.method(), &artifact.canonical_problem());
             if found != id {
                 return Err(format!("it answers problem {found}"));
             }
         }
         Shelf::Plans => {
-            let found = content_id(rest);
+            let found = content_id(bytes);
             if found != id || !artifact.is_plan() {
                 return Err(format!("it is not this plan but {found}"));
             }
         }
+        Shelf::Problems | Shelf::Shards => {
+            return Err(format!("no artifact stands among {}", shelf.name()));
+        }
     }
-    Ok((artifact, rest))
+    Ok(())
 }
 
 fn word<'a>(rest: &mut &'a [u8]) -> Result<&'a [u8], String> {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use vbar_guidance::Method;
+use vbar_guidance::{Budget, Method, control::Failure};
 
 use super::{
     Code, Error,
@@ -14,7 +14,7 @@ use super::{
 use crate::{
     store::{Put, Shelf, Store},
     telemetry::{Metrics, OutcomeLabels},
-    wire::{Artifact, ArtifactAnswer, ArtifactId, Provenance, StoredArtifact},
+    wire::{Artifact, ArtifactAnswer, ArtifactId, Provenance, StoredArtifact, Unread},
 };
 
 /// Two contents for one problem: determinism broke.
@@ -35,8 +35,9 @@ impl Shelves {
         &self,
         shelf: Shelf,
         id: ArtifactId,
+        budget: Budget<'_>,
     ) -> Result<Option<StoredArtifact>, Error> {
-        Ok(self.stored_with_bytes(shelf, id)?.map(|(stored, _)| stored))
+        Ok(self.stored_with_bytes(shelf, id, budget)?.map(|(stored, _)| stored))
     }
 
     /// The same with the artifact's own bytes.
@@ -44,18 +45,25 @@ impl Shelves {
         &self,
         shelf: Shelf,
         id: ArtifactId,
+        budget: Budget<'_>,
     ) -> Result<Option<(StoredArtifact, Bytes)>, Error> {
         let Some(record) = self.store.get(shelf, &id.0)? else { return Ok(None) };
-        match record::decode(shelf, id, &record) {
+        match record::decode_within(shelf, id, &record, budget) {
             Ok((artifact, bytes)) => {
+                if shelf == Shelf::Artifacts {
+                    // Another node may have made it.
+                    self.leases.learn(id)?;
+                }
                 let bytes = record.slice_ref(bytes);
                 Ok(Some((loaded(id, artifact, &bytes), bytes)))
             }
-            Err(what) => {
+            Err(Unread::Interrupted(why)) => Err(Failure::from(why).into()),
+            Err(Unread::Damaged(what)) => {
                 tracing::error!(%id, what, "unreadable record");
                 let (reason, kind) = match shelf {
                     Shelf::Artifacts => ("ARTIFACT_DAMAGED", "artifact"),
                     Shelf::Plans => ("PLAN_DAMAGED", "plan"),
+                    Shelf::Problems | Shelf::Shards => ("RECORD_DAMAGED", shelf.name()),
                 };
                 let message = format!("the record of {kind} {id} cannot be used: {what}");
                 Err(Error::new(Code::DataLoss, reason, message))
@@ -65,24 +73,34 @@ impl Shelves {
 
     /// Stores a new artifact. If another call was faster, both must have made the same bytes.
     /// Blocks on the store.
-    pub(super) fn keep(&self, id: ArtifactId, artifact: Artifact) -> Result<StoredArtifact, Error> {
-        let loaded = self.put(Shelf::Artifacts, id, artifact)?;
+    pub(super) fn keep(
+        &self,
+        id: ArtifactId,
+        artifact: &Artifact,
+        budget: Budget<'_>,
+    ) -> Result<StoredArtifact, Error> {
+        let loaded = self.put(Shelf::Artifacts, id, artifact, budget)?;
         self.leases.grant(id, loaded.size_bytes)?;
         Ok(loaded)
     }
 
     /// Stores a plan under the digest of its content; the same plan twice is one plan. Blocks on
     /// the store.
-    pub(super) fn keep_plan(&self, plan: Artifact) -> Result<StoredArtifact, Error> {
+    pub(super) fn keep_plan(
+        &self,
+        plan: &Artifact,
+        budget: Budget<'_>,
+    ) -> Result<StoredArtifact, Error> {
         let id = record::content_id(&plan.to_bytes());
-        self.put(Shelf::Plans, id, plan)
+        self.put(Shelf::Plans, id, plan, budget)
     }
 
     fn put(
         &self,
         shelf: Shelf,
         id: ArtifactId,
-        artifact: Artifact,
+        artifact: &Artifact,
+        budget: Budget<'_>,
     ) -> Result<StoredArtifact, Error> {
         let bytes = artifact.to_bytes();
         if shelf == Shelf::Artifacts && self.leases.expires(id).is_none() {
@@ -97,7 +115,7 @@ impl Shelves {
                 return Err(Error::internal(CONFLICT, &format!("two contents for {id}")));
             }
         }
-        Ok(loaded(id, artifact, &bytes))
+        read_back(id, artifact, &bytes, budget)
     }
 
     /// Keeps what was loaded in memory for a while.
@@ -115,6 +133,33 @@ impl Shelves {
     pub(super) fn looked_up(&self, outcome: &'static str) {
         self.metrics.artifacts.get_or_create(&OutcomeLabels { outcome }).inc();
     }
+}
+
+/// What is answered with, and stands on no shelf. Blocks on nothing.
+pub(super) fn unkept(
+    id: ArtifactId,
+    artifact: &Artifact,
+    budget: Budget<'_>,
+) -> Result<StoredArtifact, Error> {
+    read_back(id, artifact, &artifact.to_bytes(), budget)
+}
+
+/// What a node finds that reads the bytes from its store. Whoever made them answers with that too:
+/// bytes do not tell one zero from the other, and answers would. A deadline does not stop it: the
+/// answer is there.
+fn read_back(
+    id: ArtifactId,
+    artifact: &Artifact,
+    bytes: &[u8],
+    budget: Budget<'_>,
+) -> Result<StoredArtifact, Error> {
+    let patient = budget.beyond_deadline();
+    let again = Artifact::from_bytes_within(artifact.method(), bytes, patient);
+    let again = again.map_err(|unread| match unread {
+        Unread::Interrupted(why) => Failure::from(why).into(),
+        Unread::Damaged(what) => Error::internal("ARTIFACT_UNREADABLE", &format!("{id}: {what}")),
+    })?;
+    Ok(loaded(id, again, bytes))
 }
 
 /// Where something of `method` comes from.

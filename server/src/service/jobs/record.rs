@@ -5,17 +5,20 @@
 //! ```
 //!
 //! The line can be read by people. The problem is there until the job is done: it is all that is
-//! needed to go on with it.
+//! needed to go on with it. Where several machines work together it is not there: it lies on a shelf
+//! under the ticket that the line names.
 
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
-use super::Ending;
+use super::{Ending, fleet::Parts};
 use crate::wire::{Failure, NoArtifact, Standing};
 
 const FORMAT_VERSION: u32 = 1;
+/// No problem within our limits has as many shards; what is counted for each fits in memory.
+const SHARDS_MAX: usize = 1 << 20;
 
 /// A job as it is written down.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,6 +41,9 @@ struct Line {
     started_unix_ms: Option<u64>,
     ended_unix_ms: Option<u64>,
     ending: Option<WrittenEnding>,
+    /// Of a job that several machines do.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    parts: Option<Parts>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -59,12 +65,20 @@ impl JobRecord {
             attempts: 0,
             shards_done: 0,
             shards_total,
-            created_unix_ms: now(),
+            created_unix_ms: unix_ms(SystemTime::now()),
             started_unix_ms: None,
             ended_unix_ms: None,
             ending: None,
+            parts: None,
         };
         Self { line, ending: None, problem }
+    }
+
+    /// A job that several machines do waits.
+    pub(super) fn in_parts(method: &str, shards_total: usize, parts: Parts) -> Self {
+        let mut record = Self::new(method, shards_total, Bytes::new());
+        record.line.parts = Some(parts);
+        record
     }
 
     /// Its bytes.
@@ -90,6 +104,13 @@ impl JobRecord {
         if line.format != FORMAT_VERSION {
             return Err(format!("format {}, this server reads {FORMAT_VERSION}", line.format));
         }
+        if line.shards_total > SHARDS_MAX || line.shards_done > line.shards_total {
+            let (done, total) = (line.shards_done, line.shards_total);
+            return Err(format!("{done} shards of {total} are done, at most {SHARDS_MAX} can be"));
+        }
+        if line.parts.as_ref().is_some_and(|parts| !parts.fit(line.shards_total)) {
+            return Err(format!("its parts are not those of {} shards", line.shards_total));
+        }
         let ending = match line.ending.take() {
             None => None,
             Some(WrittenEnding::Made) => Some(Ending::Made),
@@ -105,8 +126,8 @@ impl JobRecord {
 
     /// It runs.
     pub(super) fn begin(&mut self) {
-        self.line.attempts += 1;
-        self.line.started_unix_ms = Some(now());
+        self.line.attempts = self.line.attempts.saturating_add(1);
+        self.line.started_unix_ms = Some(unix_ms(SystemTime::now()));
     }
 
     /// It waits again: whoever was at it has ended.
@@ -124,12 +145,28 @@ impl JobRecord {
         self.line.shards_done = done;
     }
 
-    /// It is done.
-    pub(super) fn end(&mut self, shards_done: usize, ending: Ending) {
-        self.line.shards_done = shards_done;
-        self.line.ended_unix_ms = Some(now());
+    /// It is done, at `now`. What is made is made of all its shards, whoever saw them.
+    pub(super) fn end(&mut self, shards_done: usize, ending: Ending, now: SystemTime) {
+        let is_made = ending == Ending::Made;
+        self.line.shards_done = if is_made { self.line.shards_total } else { shards_done };
+        self.line.ended_unix_ms = Some(unix_ms(now));
         self.ending = Some(ending);
         self.problem = Bytes::new();
+    }
+
+    /// Where the parts of a job stand that several machines do.
+    pub(super) fn parts(&self) -> Option<&Parts> {
+        self.line.parts.as_ref()
+    }
+
+    /// The same, to be changed.
+    pub(super) fn parts_mut(&mut self) -> Option<&mut Parts> {
+        self.line.parts.as_mut()
+    }
+
+    /// A part of it was begun so often.
+    pub(super) fn set_attempts(&mut self, attempts: u32) {
+        self.line.attempts = self.line.attempts.max(attempts);
     }
 
     pub(super) fn method(&self) -> &str {
@@ -179,9 +216,8 @@ impl JobRecord {
     }
 }
 
-/// Now, to the millisecond.
-fn now() -> u64 {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+fn unix_ms(time: SystemTime) -> u64 {
+    let since = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }
 
@@ -203,15 +239,15 @@ mod tests {
         let again = JobRecord::decode(&record.encode().into()).unwrap();
         assert_eq!((again.standing(), again.attempts()), (Standing::Running, 1));
         assert_eq!(again.problem(), problem);
-        for (ending, standing) in [
-            (Ending::Made, Standing::Succeeded),
-            (Ending::Cancelled, Standing::Cancelled),
-            (Ending::Failed(Failure::cancelled()), Standing::Failed),
+        for (ending, standing, done) in [
+            (Ending::Made, Standing::Succeeded, 7),
+            (Ending::Cancelled, Standing::Cancelled, 3),
+            (Ending::Failed(Failure::cancelled()), Standing::Failed, 3),
         ] {
             let mut ended = record.clone();
-            ended.end(3, ending);
+            ended.end(3, ending, SystemTime::now());
             let again = JobRecord::decode(&ended.encode().into()).unwrap();
-            assert_eq!((again.standing(), again.shards_done()), (standing, 3));
+            assert_eq!((again.standing(), again.shards_done()), (standing, done));
             assert_eq!(again, ended);
             assert_eq!(again.problem(), b"", "nobody needs it any more");
         }
@@ -225,6 +261,19 @@ mod tests {
         let good = String::from_utf8(JobRecord::new("m", 1, Bytes::new()).encode()).unwrap();
         let other = good.replace("\"format\":1", "\"format\":2");
         assert!(fault(&other).unwrap_err().contains("format 2"));
+        // A mirror counts for each shard: so many would take all memory there is.
+        let many = good.replace("\"shards_total\":1", &format!("\"shards_total\":{}", usize::MAX));
+        assert!(fault(&many).unwrap_err().contains("shards"));
+        let beyond = good.replace("\"shards_done\":0", "\"shards_done\":2");
+        assert!(fault(&beyond).unwrap_err().contains("2 shards of 1"));
+        let parts = |done: &str, ticket: usize| {
+            let parts = format!("{{\"ticket\":\"{}\",\"done\":\"{done}\"}}", "00".repeat(ticket));
+            fault(&good.replace("\"ending\":null", &format!("\"ending\":null,\"parts\":{parts}")))
+        };
+        assert!(parts("01", 24).is_ok());
+        for (done, ticket) in [("", 24), ("02", 24), ("0100", 24), ("01", 23)] {
+            assert!(parts(done, ticket).unwrap_err().contains("parts"), "{done} {ticket}");
+        }
         let more = good.replace("\"format\":1", "\"format\":1,\"more\":1");
         assert!(fault(&more).unwrap_err().contains("more"));
     }

@@ -1,113 +1,96 @@
-//! Jobs whose shards wait until they are let go.
+//! What callers see of jobs is the same whoever does them.
 
-use std::{
-    collections::BTreeMap,
-    sync::atomic::{AtomicUsize, Ordering},
-};
+use std::{sync::Arc, thread};
 
 use super::*;
-use crate::{store::MemoryStore, wire::Standing};
-
-/// Where the work of a test looks what it should do, and notes what it did.
-#[derive(Debug, Default)]
-struct Stage {
-    /// Shards that may still be computed.
-    let_go: AtomicUsize,
-    begun: Mutex<Vec<(u8, usize)>>,
-    made: Mutex<BTreeMap<u8, Vec<usize>>>,
-}
-
-impl Stage {
-    fn let_go(&self, shards: usize) {
-        self.let_go.fetch_add(shards, Ordering::SeqCst);
-    }
-
-    fn begun(&self) -> Vec<(u8, usize)> {
-        self.begun.lock().unwrap().clone()
-    }
-
-    fn take_one(&self) -> bool {
-        let take = |left: usize| left.checked_sub(1);
-        self.let_go.fetch_update(Ordering::SeqCst, Ordering::SeqCst, take).is_ok()
-    }
-}
-
-/// Collects the numbers of its shards.
-#[derive(Debug)]
-struct Counting {
-    name: u8,
-    shards: usize,
-    stage: Arc<Stage>,
-}
-
-const PANICS: u8 = 200;
-const CANNOT: u8 = 201;
-
-impl Work for Counting {
-    type Shard = usize;
-
-    fn method(&self) -> &'static str {
-        "counting"
-    }
-
-    fn is_made(&self) -> bool {
-        self.stage.made.lock().unwrap().contains_key(&self.name)
-    }
-
-    fn shards(&self) -> usize {
-        self.shards
-    }
-
-    fn run_shard(&self, shard: usize, budget: Budget<'_>) -> Result<usize, Stopped> {
-        budget.tell(1, 2);
-        self.stage.begun.lock().unwrap().push((self.name, shard));
-        assert_ne!(self.name, PANICS, "a bug");
-        while !self.stage.take_one() {
-            budget.check().map_err(|interruption| {
-                let failure = vbar_guidance::control::Failure::from(interruption);
-                Stopped::Failed(Error::from(failure).into())
-            })?;
-            thread::yield_now();
-        }
-        Ok(shard)
-    }
-
-    fn finish(&self, shards: Vec<usize>, _: Budget<'_>) -> Result<(), Stopped> {
-        if self.name == CANNOT {
-            return Err(Stopped::Infeasible(NoArtifact::from_bytes(b"").unwrap()));
-        }
-        self.stage.made.lock().unwrap().insert(self.name, shards);
-        Ok(())
-    }
-}
-
-const LIMITS: JobLimits = JobLimits {
-    threads: 2,
-    unfinished_max: 4,
-    time_max: Duration::from_secs(60),
-    attempts_max: 3,
-    kept_for: Duration::from_secs(3600),
+use crate::{
+    service::{
+        clock::{Clock, tests::Hands},
+        jobs::fixture::{CANNOT, Counting, LIMITS, PANICS, Stage},
+    },
+    store::{Ledger, MemoryShared, MemoryStore, Store},
+    telemetry::Metrics,
+    wire::Standing,
 };
 
-fn opened(store: &Arc<dyn Store>, stage: &Arc<Stage>, limits: JobLimits) -> Jobs<Counting> {
-    let metrics = Arc::new(Metrics::new());
-    Jobs::open(Arc::clone(store), limits, metrics, |_, problem| {
-        Ok(Counting { name: problem[0], shards: problem[1].into(), stage: Arc::clone(stage) })
-    })
-    .unwrap()
+/// What does the jobs.
+#[derive(Debug, Clone)]
+enum By {
+    Single(Arc<MemoryStore>),
+    Fleet(Arc<MemoryShared>),
+}
+
+impl By {
+    fn single() -> Self {
+        Self::Single(Arc::new(MemoryStore::new(1 << 20)))
+    }
+
+    fn fleet() -> Self {
+        Self::Fleet(Arc::new(MemoryShared::new(Duration::from_millis(400))))
+    }
+
+    fn store(&self) -> Arc<dyn Store> {
+        match self {
+            Self::Single(store) => Arc::clone(store) as _,
+            Self::Fleet(store) => Arc::clone(store) as _,
+        }
+    }
+
+    /// A node on the store.
+    fn open(
+        &self,
+        stage: &Arc<Stage>,
+        clock: Arc<Clock>,
+        limits: JobLimits,
+    ) -> Arc<dyn Jobs<Counting>> {
+        let metrics = Arc::new(Metrics::new());
+        let stage = Arc::clone(stage);
+        let restore = move |_, problem: &[u8]| {
+            Ok(Counting { name: problem[0], shards: problem[1].into(), stage: Arc::clone(&stage) })
+        };
+        match self {
+            Self::Single(store) => {
+                let store = Arc::clone(store) as _;
+                Arc::new(Single::open(store, clock, limits, metrics, restore).unwrap())
+            }
+            Self::Fleet(store) => {
+                let store = Arc::clone(store) as _;
+                Arc::new(Fleet::open(store, clock, limits, metrics, Box::new(restore)).unwrap())
+            }
+        }
+    }
 }
 
 struct Fixture {
-    store: Arc<dyn Store>,
+    by: By,
     stage: Arc<Stage>,
-    jobs: Jobs<Counting>,
+    hands: Hands,
+    jobs: Arc<dyn Jobs<Counting>>,
 }
 
-fn fixture(limits: JobLimits) -> Fixture {
-    let store: Arc<dyn Store> = Arc::new(MemoryStore::new(1 << 20));
+fn fixture(by: &By, limits: JobLimits) -> Fixture {
     let stage = Arc::<Stage>::default();
-    let jobs = opened(&store, &stage, limits);
-    Fixture { store, stage, jobs }
+    let hands = Hands::new();
+    let jobs = by.open(&stage, hands.clock(), limits);
+    Fixture { by: by.clone(), stage, hands, jobs }
+}
+
+/// Makes a test for each of those who do jobs of every function named.
+macro_rules! whoever_does_them {
+    ($($name:ident),* $(,)?) => {
+        mod single {
+            $(#[tokio::test]
+            async fn $name() {
+                super::$name(&super::By::single()).await;
+            })*
+        }
+        mod fleet {
+            $(#[tokio::test]
+            async fn $name() {
+                super::$name(&super::By::fleet()).await;
+            })*
+        }
+    };
 }
 
 fn id(name: u8) -> ArtifactId {
@@ -116,9 +99,11 @@ fn id(name: u8) -> ArtifactId {
 
 impl Fixture {
     fn order(&self, name: u8, shards: u8, request_id: Option<&str>) -> Result<View, Error> {
+        let work = Counting { name, shards: shards.into(), stage: Arc::clone(&self.stage) };
         self.jobs.submit(Order {
             id: id(name),
-            work: Counting { name, shards: shards.into(), stage: Arc::clone(&self.stage) },
+            is_made: work.is_made()?,
+            work,
             problem: vec![name, shards].into(),
             request_id: request_id.map(str::to_owned),
         })
@@ -144,34 +129,61 @@ impl Fixture {
         self.jobs.view(id(name)).unwrap().progress.standing
     }
 
+    /// Waits until a job is as far as that.
+    fn until(&self, name: u8, there: impl Fn(&View) -> bool) {
+        let patience = Instant::now() + Duration::from_secs(30);
+        loop {
+            let view = self.jobs.view(id(name)).unwrap();
+            if there(&view) {
+                return;
+            }
+            assert!(Instant::now() < patience, "{view:?}");
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+
     /// Another node on the same store, after this one.
     fn reopened(self) -> Self {
-        let Self { store, stage, jobs } = self;
+        let Self { by, stage, hands, jobs } = self;
         drop(jobs);
-        let jobs = opened(&store, &stage, LIMITS);
-        Self { store, stage, jobs }
+        let jobs = by.open(&stage, hands.clock(), LIMITS);
+        Self { by, stage, hands, jobs }
     }
 }
 
-#[tokio::test]
-async fn job_runs_its_shards_and_merges_them_in_order() {
-    let f = fixture(LIMITS);
+whoever_does_them!(
+    job_runs_its_shards_and_merges_them_in_order,
+    job_is_joined_by_the_same_order_and_computed_once,
+    job_whose_product_is_there_is_done_at_once,
+    job_made_is_found_if_its_node_ended_before_that_was_written,
+    job_infeasible_stays_so,
+    job_cancelled_stops_at_once_and_can_be_started_afresh,
+    job_panic_is_one_failed_job,
+    job_that_takes_too_long_fails,
+    job_request_id_names_one_job,
+    jobs_too_many_are_refused_with_a_time_to_come_back,
+    jobs_are_listed_by_id_and_by_standing,
+    job_is_forgotten_when_it_is_deleted_or_old_but_not_while_it_runs,
+    clock_jump_forgets_no_job_and_no_request_before_its_time,
+    wait_ends_at_its_time_and_when_the_node_ends,
+);
+
+async fn job_runs_its_shards_and_merges_them_in_order(by: &By) {
+    let f = fixture(by, LIMITS);
     let view = f.order(1, 5, None).unwrap();
     assert_eq!((view.progress.shards_total, view.ending), (5, None));
     f.until_begun(2);
-    let running = f.jobs.view(id(1)).unwrap().progress;
-    assert_eq!(running.standing, Standing::Running);
+    assert_eq!(f.standing(1), Standing::Running);
     // Two half shards of five and a merge.
-    assert!((running.fraction.unwrap() - 1.0 / 6.0).abs() < 1e-6, "{running:?}");
+    f.until(1, |view| (view.progress.fraction.unwrap() - 1.0 / 6.0).abs() < 1e-6);
     f.stage.let_go(5);
     let view = f.ended(1).await;
     assert_eq!((view.ending, view.progress.shards_done), (Some(Ending::Made), 5));
     assert_eq!(f.stage.made.lock().unwrap()[&1], [0, 1, 2, 3, 4]);
 }
 
-#[tokio::test]
-async fn job_is_joined_by_the_same_order_and_computed_once() {
-    let f = fixture(LIMITS);
+async fn job_is_joined_by_the_same_order_and_computed_once(by: &By) {
+    let f = fixture(by, LIMITS);
     let first = f.order(1, 1, None).unwrap();
     assert_eq!(f.order(1, 1, None).unwrap().progress.created, first.progress.created);
     f.stage.let_go(9);
@@ -180,9 +192,8 @@ async fn job_is_joined_by_the_same_order_and_computed_once() {
     assert_eq!(f.stage.begun(), [(1, 0)]);
 }
 
-#[tokio::test]
-async fn job_whose_product_is_there_is_done_at_once() {
-    let f = fixture(LIMITS);
+async fn job_whose_product_is_there_is_done_at_once(by: &By) {
+    let f = fixture(by, LIMITS);
     f.stage.made.lock().unwrap().insert(1, vec![0]);
     assert_eq!(f.order(1, 1, None).unwrap().ending, Some(Ending::Made));
     // Once it is gone it is made again.
@@ -191,18 +202,20 @@ async fn job_whose_product_is_there_is_done_at_once() {
     f.order(1, 1, None).unwrap();
     assert_eq!(f.ended(1).await.ending, Some(Ending::Made));
     assert_eq!(f.stage.begun(), [(1, 0)]);
-    // It is found also if its node ended before it could write that down.
-    f.order(2, 1, None).unwrap();
-    f.until_begun(2);
-    f.stage.made.lock().unwrap().insert(2, vec![0]);
-    let f = f.reopened();
-    assert_eq!(f.standing(2), Standing::Succeeded);
-    assert_eq!(f.stage.begun(), [(1, 0), (2, 0)]);
 }
 
-#[tokio::test]
-async fn job_infeasible_stays_so() {
-    let f = fixture(LIMITS);
+async fn job_made_is_found_if_its_node_ended_before_that_was_written(by: &By) {
+    let f = fixture(by, LIMITS);
+    f.order(2, 1, None).unwrap();
+    f.until_begun(1);
+    f.stage.made.lock().unwrap().insert(2, vec![0]);
+    let f = f.reopened();
+    f.until(2, |view| view.progress.standing == Standing::Succeeded);
+    assert_eq!(f.stage.begun(), [(2, 0)]);
+}
+
+async fn job_infeasible_stays_so(by: &By) {
+    let f = fixture(by, LIMITS);
     f.stage.let_go(9);
     f.order(CANNOT, 1, None).unwrap();
     let view = f.ended(CANNOT).await;
@@ -213,9 +226,8 @@ async fn job_infeasible_stays_so() {
     assert_eq!(f.stage.begun().len(), 1);
 }
 
-#[tokio::test]
-async fn job_cancelled_stops_at_once_and_can_be_started_afresh() {
-    let f = fixture(LIMITS);
+async fn job_cancelled_stops_at_once_and_can_be_started_afresh(by: &By) {
+    let f = fixture(by, LIMITS);
     f.order(1, 3, None).unwrap();
     f.until_begun(2);
     f.jobs.cancel(id(1)).unwrap();
@@ -234,9 +246,8 @@ async fn job_cancelled_stops_at_once_and_can_be_started_afresh() {
     assert_eq!(f.standing(1), Standing::Succeeded);
 }
 
-#[tokio::test]
-async fn job_panic_is_one_failed_job() {
-    let f = fixture(JobLimits { threads: 1, ..LIMITS });
+async fn job_panic_is_one_failed_job(by: &By) {
+    let f = fixture(by, JobLimits { threads: 1, ..LIMITS });
     f.order(PANICS, 1, None).unwrap();
     let Some(Ending::Failed(failure)) = f.ended(PANICS).await.ending else { panic!("it ended") };
     assert_eq!(failure.reason, "PANIC");
@@ -245,18 +256,16 @@ async fn job_panic_is_one_failed_job() {
     assert_eq!(f.ended(1).await.ending, Some(Ending::Made));
 }
 
-#[tokio::test]
-async fn job_that_takes_too_long_fails() {
-    let f = fixture(JobLimits { time_max: Duration::from_millis(20), ..LIMITS });
+async fn job_that_takes_too_long_fails(by: &By) {
+    let f = fixture(by, JobLimits { time_max: Duration::from_millis(20), ..LIMITS });
     f.order(1, 1, None).unwrap();
     let Some(Ending::Failed(failure)) = f.ended(1).await.ending else { panic!("it ended") };
     assert_eq!(failure.reason, "DEADLINE_EXCEEDED");
 }
 
-#[tokio::test]
-async fn job_request_id_names_one_job() {
+async fn job_request_id_names_one_job(by: &By) {
     const REQUEST: Option<&str> = Some("0b5d5d0e-5d2c-4c3a-9d7e-1f6f5a3c9b01");
-    let f = fixture(LIMITS);
+    let f = fixture(by, LIMITS);
     f.order(1, 1, REQUEST).unwrap();
     let refused = f.order(2, 1, REQUEST).unwrap_err();
     assert_eq!((refused.code, refused.reason), (Code::AlreadyExists, "REQUEST_ID_REUSED"));
@@ -269,7 +278,8 @@ async fn job_request_id_names_one_job() {
 
 #[tokio::test]
 async fn job_long_does_not_hold_up_a_short_one() {
-    let f = fixture(JobLimits { threads: 1, ..LIMITS });
+    let by = &By::single();
+    let f = fixture(by, JobLimits { threads: 1, ..LIMITS });
     f.order(1, 4, None).unwrap();
     f.until_begun(1);
     f.order(2, 1, None).unwrap();
@@ -278,9 +288,8 @@ async fn job_long_does_not_hold_up_a_short_one() {
     assert_eq!(f.stage.begun(), [(1, 0), (1, 1), (2, 0), (1, 2), (1, 3)]);
 }
 
-#[tokio::test]
-async fn jobs_too_many_are_refused_with_a_time_to_come_back() {
-    let f = fixture(LIMITS);
+async fn jobs_too_many_are_refused_with_a_time_to_come_back(by: &By) {
+    let f = fixture(by, LIMITS);
     for name in 1..=4 {
         f.order(name, 1, None).unwrap();
     }
@@ -295,7 +304,8 @@ async fn jobs_too_many_are_refused_with_a_time_to_come_back() {
 
 #[tokio::test]
 async fn job_survives_its_node() {
-    let f = fixture(LIMITS);
+    let by = &By::single();
+    let f = fixture(by, LIMITS);
     f.order(1, 3, None).unwrap();
     f.until_begun(2);
     // Killed: nothing was handed back.
@@ -316,7 +326,8 @@ async fn job_survives_its_node() {
 
 #[tokio::test]
 async fn job_that_ends_its_node_each_time_is_given_up() {
-    let mut f = fixture(LIMITS);
+    let by = &By::single();
+    let mut f = fixture(by, LIMITS);
     f.order(1, 1, None).unwrap();
     for attempt in 1..=3 {
         f.until_begun(attempt);
@@ -329,9 +340,8 @@ async fn job_that_ends_its_node_each_time_is_given_up() {
     assert!(failure.message.contains("3 times"), "{}", failure.message);
 }
 
-#[tokio::test]
-async fn jobs_are_listed_by_id_and_by_standing() {
-    let f = fixture(JobLimits { threads: 1, ..LIMITS });
+async fn jobs_are_listed_by_id_and_by_standing(by: &By) {
+    let f = fixture(by, JobLimits { threads: 1, ..LIMITS });
     for name in [3, 1, 2] {
         f.order(name, 1, None).unwrap();
         f.until_begun(1);
@@ -347,30 +357,55 @@ async fn jobs_are_listed_by_id_and_by_standing() {
     assert_eq!(standings, [Standing::Queued, Standing::Cancelled, Standing::Running]);
 }
 
-#[tokio::test]
-async fn job_is_forgotten_when_it_is_deleted_or_old_but_not_while_it_runs() {
-    let f = fixture(LIMITS);
+async fn job_is_forgotten_when_it_is_deleted_or_old_but_not_while_it_runs(by: &By) {
+    let f = fixture(by, LIMITS);
     f.order(1, 1, None).unwrap();
     f.until_begun(1);
     assert_eq!(f.jobs.delete(id(1)).unwrap_err().reason, "OPERATION_RUNNING");
-    let later = SystemTime::now() + 2 * LIMITS.kept_for;
-    f.jobs.sweep(later);
+    f.hands.pass(2 * LIMITS.kept_for);
+    f.jobs.sweep();
     f.stage.let_go(2);
     f.ended(1).await;
     f.order(2, 1, None).unwrap();
     f.ended(2).await;
     f.jobs.delete(id(1)).unwrap();
     assert_eq!(f.jobs.view(id(1)).unwrap_err().code, Code::NotFound);
-    f.jobs.sweep(SystemTime::now());
+    f.jobs.sweep();
     assert_eq!(f.standing(2), Standing::Succeeded);
-    f.jobs.sweep(later);
+    f.hands.pass(2 * LIMITS.kept_for);
+    f.jobs.sweep();
     assert_eq!(f.jobs.view(id(2)).unwrap_err().code, Code::NotFound);
-    assert_eq!(f.store.entries(Ledger::Jobs).unwrap(), Vec::<[u8; 32]>::new());
+    assert_eq!(f.by.store().entries(Ledger::Jobs).unwrap(), Vec::<[u8; 32]>::new());
 }
 
-#[tokio::test]
-async fn wait_ends_at_its_time_and_when_the_node_ends() {
-    let f = fixture(LIMITS);
+async fn clock_jump_forgets_no_job_and_no_request_before_its_time(by: &By) {
+    const REQUEST: Option<&str> = Some("1f1c2a52-3f39-4a6e-8c53-b6a4b2f7d902");
+    let f = fixture(by, LIMITS);
+    f.stage.let_go(9);
+    for (name, request_id, is_back) in [(1, REQUEST, false), (2, None, true)] {
+        // Days there, something ends, and back.
+        let right = f.hands.now().system;
+        let days = 48 * LIMITS.kept_for;
+        f.hands.set(if is_back { right - days } else { right + days });
+        f.order(name, 1, request_id).unwrap();
+        f.ended(name).await;
+        f.jobs.sweep();
+        f.hands.set(right);
+        f.hands.pass(LIMITS.kept_for / 3);
+        f.jobs.sweep();
+        assert_eq!(f.standing(name), Standing::Succeeded);
+    }
+    assert_eq!(f.standing(1), Standing::Succeeded);
+    let refused = f.order(2, 1, REQUEST).unwrap_err();
+    assert_eq!(refused.reason, "REQUEST_ID_REUSED");
+    f.hands.pass(50 * LIMITS.kept_for);
+    f.jobs.sweep();
+    assert_eq!(f.jobs.view(id(1)).unwrap_err().code, Code::NotFound);
+    assert_eq!(f.by.store().entries(Ledger::Requests).unwrap(), Vec::<[u8; 32]>::new());
+}
+
+async fn wait_ends_at_its_time_and_when_the_node_ends(by: &By) {
+    let f = fixture(by, LIMITS);
     f.order(1, 1, None).unwrap();
     let soon = Instant::now() + Duration::from_millis(20);
     assert_eq!(f.jobs.wait(id(1), soon).await.unwrap().ending, None);

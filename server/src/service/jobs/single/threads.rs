@@ -3,21 +3,20 @@
 
 use std::{
     io,
-    panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, atomic::Ordering},
     thread::{self, JoinHandle},
     time::Instant,
 };
 
-use vbar_guidance::{Budget, Interruption, Progress};
+use vbar_guidance::{Budget, Progress};
 
 use super::{
-    Ending, Inner, Stopped, Work,
+    Ending, Inner, Work,
     board::{RunKey, Turn},
 };
 use crate::{
-    compute::{ComputeError, panic_text},
-    service::Error,
+    compute::{until, yield_to_steps},
+    service::jobs::caught,
     store::Ledger,
     wire::ArtifactId,
 };
@@ -34,6 +33,7 @@ pub(super) fn start<W: Work>(inner: &Arc<Inner<W>>) -> io::Result<Vec<JoinHandle
 impl<W: Work> Inner<W> {
     /// Body of a thread.
     fn work(&self) {
+        yield_to_steps();
         while let Some(turn) = self.next_turn() {
             if turn.is_first {
                 self.write_down_begin(turn.id, &turn.run);
@@ -73,15 +73,7 @@ impl<W: Work> Inner<W> {
 
     /// Computes a shard, and finishes the job with the last one. How the job ended, if it did.
     fn run(&self, turn: &Turn<W>) -> Option<Ending> {
-        let stop = || {
-            if turn.run.load(Ordering::Relaxed) {
-                Some(Interruption::Cancelled)
-            } else if Instant::now() >= turn.deadline {
-                Some(Interruption::Deadline)
-            } else {
-                None
-            }
-        };
+        let stop = until(turn.deadline, Arc::clone(&turn.run));
         let start = Instant::now();
         let tell = |progress: Progress| turn.told.shard(turn.shard, progress);
         let budget = Budget::new(&stop);
@@ -103,14 +95,4 @@ impl<W: Work> Inner<W> {
         let is_stopped = ended.is_err() && turn.run.load(Ordering::Relaxed);
         (!is_stopped).then(|| ended.map_or_else(Ending::from, |()| Ending::Made))
     }
-}
-
-/// A panic is one failed job: it is repeated exactly whenever the job is.
-fn caught<T>(work: impl FnOnce() -> Result<T, Stopped>) -> Result<T, Stopped> {
-    // Nothing survives a panic but the message: shards are only read, and a job that ends so
-    // delivers nothing.
-    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
-        let error = Error::from(ComputeError::Panicked(panic_text(&*panic)));
-        Err(Stopped::Failed(error.into()))
-    })
 }

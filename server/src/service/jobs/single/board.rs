@@ -13,10 +13,7 @@ use std::{
 use tokio::sync::watch;
 
 use super::{Ending, JobRecord, View, Work};
-use crate::{
-    store::Revision,
-    wire::{ArtifactId, Progress},
-};
+use crate::{store::Revision, wire::ArtifactId};
 
 /// Names one run of a job; set when it is to stop.
 pub(super) type RunKey = Arc<AtomicBool>;
@@ -147,21 +144,7 @@ impl<W: Work> Job<W> {
 
     /// As it stands.
     pub(super) fn view(&self) -> View {
-        let record = &self.record;
-        let progress = Progress {
-            id: self.id,
-            method: record.method().to_owned(),
-            standing: record.standing(),
-            shards_done: record.shards_done(),
-            shards_total: record.shards_total(),
-            fraction: self.run.as_ref().map(|run| run.told.fraction()),
-            attempts: record.attempts(),
-            created: record.created(),
-            started: record.started(),
-            ended: record.ended(),
-            seen: SystemTime::now(),
-        };
-        View { progress, ending: record.ending().cloned() }
+        View::new(self.id, &self.record, self.run.as_ref().map(|run| run.told.fraction()))
     }
 }
 
