@@ -29,6 +29,29 @@ pub(crate) struct MethodLabels {
     pub(crate) method: &'static str,
 }
 
+/// Computations that share threads.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct LaneLabels {
+    /// `steps`, `plans` or `records`.
+    pub(crate) lane: &'static str,
+}
+
+/// Why no compute thread took something on.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct RefusalLabels {
+    /// Whose threads.
+    pub(crate) lane: &'static str,
+    /// One of a fixed list.
+    pub(crate) reason: &'static str,
+}
+
+/// What a certificate claims.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+pub(crate) struct ClaimLabels {
+    /// One of a fixed list.
+    pub(crate) claim: &'static str,
+}
+
 /// What came of something.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 pub(crate) struct OutcomeLabels {
@@ -49,17 +72,19 @@ pub(crate) struct Metrics {
     /// Time on a compute thread.
     pub(crate) compute_seconds: Family<MethodLabels, Histogram>,
     /// Time a call waited for a compute thread.
-    pub(crate) compute_wait_seconds: Histogram,
+    pub(crate) compute_wait_seconds: Family<LaneLabels, Histogram>,
     /// Computations under way.
-    pub(crate) computations: Gauge,
+    pub(crate) computations: Family<LaneLabels, Gauge>,
     /// Calls waiting for a compute thread.
-    pub(crate) compute_waiting: Gauge,
-    /// Calls refused because no compute thread was free.
-    pub(crate) compute_refused: Counter,
+    pub(crate) compute_waiting: Family<LaneLabels, Gauge>,
+    /// Calls that no compute thread took on.
+    pub(crate) compute_refused: Family<RefusalLabels, Counter>,
     /// Computations that panicked.
     pub(crate) compute_panics: Counter,
     /// Steps by verdict.
     pub(crate) verdicts: Family<OutcomeLabels, Counter>,
+    /// Commands by what they claim: how many are fallbacks.
+    pub(crate) commands: Family<ClaimLabels, Counter>,
     /// Simplex pivots.
     pub(crate) simplex_pivots: Counter,
     /// Programs the simplex gave up to the general solver.
@@ -84,6 +109,22 @@ pub(crate) struct Metrics {
     pub(crate) connections: Gauge,
     /// Connections dropped because too many were open.
     pub(crate) connections_refused: Counter,
+    /// TLS handshakes: `completed`, `failed`, `slow`.
+    pub(crate) tls_handshakes: Family<OutcomeLabels, Counter>,
+    /// Calls at the gate: `admitted`, `unauthenticated`, `role`, `rate`, `calls`.
+    pub(crate) admissions: Family<OutcomeLabels, Counter>,
+    /// Changed files with credentials: `loaded`, `refused`.
+    pub(crate) credential_reloads: Family<OutcomeLabels, Counter>,
+    /// Lines that are missing in the audit file.
+    pub(crate) audit_lines_lost: Counter,
+    /// Exchanges for the black box: `written`, `lost`, `withheld`.
+    pub(crate) recorded_exchanges: Family<OutcomeLabels, Counter>,
+    /// Threads of the runtime that serves connections.
+    runtime_workers: Gauge,
+    /// Tasks on it: connections, calls, watchers.
+    runtime_tasks: Gauge,
+    /// Tasks that wait for one of its threads.
+    runtime_queue: Gauge,
 }
 
 /// 50 µs to 26 s.
@@ -100,12 +141,13 @@ impl Metrics {
             request_seconds: Family::new_with_constructor(durations),
             stream_messages: Family::default(),
             compute_seconds: Family::new_with_constructor(durations),
-            compute_wait_seconds: durations(),
-            computations: Gauge::default(),
-            compute_waiting: Gauge::default(),
-            compute_refused: Counter::default(),
+            compute_wait_seconds: Family::new_with_constructor(durations),
+            computations: Family::default(),
+            compute_waiting: Family::default(),
+            compute_refused: Family::default(),
             compute_panics: Counter::default(),
             verdicts: Family::default(),
+            commands: Family::default(),
             simplex_pivots: Counter::default(),
             general_solver_calls: Counter::default(),
             certificate_failures: Counter::default(),
@@ -118,8 +160,24 @@ impl Metrics {
             artifacts_expired: Counter::default(),
             connections: Gauge::default(),
             connections_refused: Counter::default(),
+            tls_handshakes: Family::default(),
+            admissions: Family::default(),
+            credential_reloads: Family::default(),
+            audit_lines_lost: Counter::default(),
+            recorded_exchanges: Family::default(),
+            runtime_workers: Gauge::default(),
+            runtime_tasks: Gauge::default(),
+            runtime_queue: Gauge::default(),
         };
         metrics.register();
+        // A lane that never refused anything says so.
+        for lane in ["steps", "plans", "records"] {
+            for reason in ["backlog", "full", "late"] {
+                let _ = metrics.compute_refused.get_or_create(&RefusalLabels { lane, reason });
+            }
+            let _ = metrics.compute_waiting.get_or_create(&LaneLabels { lane });
+            let _ = metrics.computations.get_or_create(&LaneLabels { lane });
+        }
         metrics
     }
 
@@ -141,10 +199,11 @@ impl Metrics {
         r.register("computations", "Computations under way", self.computations.clone());
         let help = "Calls waiting for a compute thread";
         r.register("compute_waiting", help, self.compute_waiting.clone());
-        let help = "Calls refused because no compute thread was free";
+        let help = "Calls that no compute thread took on";
         r.register("compute_refused", help, self.compute_refused.clone());
         r.register("compute_panics", "Computations that panicked", self.compute_panics.clone());
         r.register("verdicts", "Steps by verdict", self.verdicts.clone());
+        r.register("commands", "Commands by what they claim", self.commands.clone());
         r.register("simplex_pivots", "Pivots of the simplex", self.simplex_pivots.clone());
         let help = "Programs the simplex gave up to the general solver";
         r.register("general_solver_calls", help, self.general_solver_calls.clone());
@@ -164,10 +223,39 @@ impl Metrics {
         r.register("connections", "Open connections", self.connections.clone());
         let help = "Connections dropped because too many were open";
         r.register("connections_refused", help, self.connections_refused.clone());
+        let help = "TLS handshakes by what became of them";
+        r.register("tls_handshakes", help, self.tls_handshakes.clone());
+        r.register("admissions", "Calls at the gate", self.admissions.clone());
+        let help = "Changed files with credentials";
+        r.register("credential_reloads", help, self.credential_reloads.clone());
+        let help = "Lines missing in the audit file";
+        r.register("audit_lines_lost", help, self.audit_lines_lost.clone());
+        let help = "Exchanges for the recording by what became of them";
+        r.register("recorded_exchanges", help, self.recorded_exchanges.clone());
+        let help = "Threads that serve connections";
+        r.register("runtime_workers", help, self.runtime_workers.clone());
+        let help = "Tasks on the threads that serve connections";
+        r.register("runtime_tasks", help, self.runtime_tasks.clone());
+        let help = "Tasks that wait for a thread that serves connections";
+        r.register("runtime_queue", help, self.runtime_queue.clone());
+    }
+
+    /// What the runtime says of itself at this moment; nothing outside of one.
+    fn look_at_the_runtime(&self) {
+        let Ok(runtime) = tokio::runtime::Handle::try_current() else { return };
+        let metrics = runtime.metrics();
+        for (gauge, count) in [
+            (&self.runtime_workers, metrics.num_workers()),
+            (&self.runtime_tasks, metrics.num_alive_tasks()),
+            (&self.runtime_queue, metrics.global_queue_depth()),
+        ] {
+            gauge.set(i64::try_from(count).unwrap_or(i64::MAX));
+        }
     }
 
     /// The OpenMetrics text.
     pub(crate) fn text(&self) -> String {
+        self.look_at_the_runtime();
         let mut text = String::new();
         encode(&mut text, &self.registry).expect("a String takes everything");
         text

@@ -11,9 +11,10 @@ use vbar_proto::{
 
 use super::{Draining, Grpc, request_id, status};
 use crate::{
+    access::Pass,
     service::{Call, Code, Error, Service, Session, SessionAnswer, Timed},
     telemetry::{OutcomeLabels, RequestId},
-    transport::{SERVER_TIMING, server_timing},
+    transport::{SERVER_TIMING, pass, server_timing},
     wire::{self, Render as _, StreamCall},
 };
 
@@ -128,7 +129,10 @@ impl GuidanceService for Grpc {
         request: Request<Streaming<v1::StepStreamRequest>>,
     ) -> Result<Response<Self::StepStreamStream>, Status> {
         let id = request_id(&request);
-        let call = self.head(&request).map_err(|error| status::render(error, &id))?;
+        let opening = self
+            .head(&request)
+            .and_then(|call| pass(request.extensions()).map(|pass| (call, pass.clone())));
+        let (call, pass) = opening.map_err(|error| status::render(error, &id))?;
         // Without a wish of its own a stream may live on; each of its steps has a deadline.
         let ends = request.metadata().contains_key("grpc-timeout").then_some(call.deadline);
         let closed_loop = Loop {
@@ -137,6 +141,7 @@ impl GuidanceService for Grpc {
             grpc: self.clone(),
             draining: self.draining.clone(),
             ends,
+            pass,
             id,
             over: false,
         };
@@ -182,6 +187,7 @@ struct Loop {
     grpc: Grpc,
     draining: Draining,
     ends: Option<Instant>,
+    pass: Pass,
     id: RequestId,
     over: bool,
 }
@@ -209,7 +215,15 @@ impl Loop {
                 self.over = true;
                 return Some(Err(status::complete(fault, &self.id)));
             }
-            Ok(Some(message)) => self.answer(&message).await,
+            Ok(Some(message)) => match self.pass.message() {
+                Ok(()) => self.answer(&message).await,
+                Err(refusal) if refusal.is_for_now() => Err(refusal.into()),
+                // Its token has expired, or was taken from it.
+                Err(refusal) => {
+                    self.over = true;
+                    return Some(Err(status::render(refusal.into(), &self.id)));
+                }
+            },
         };
         let (result, outcome) = match outcome {
             Ok(SessionAnswer::Step(timed)) => {
@@ -234,6 +248,7 @@ impl Loop {
         let message = wire::parse::<StreamCall>(message, &service.limits())?;
         let limit = service.deadline(None);
         let deadline = self.ends.map_or(limit, |ends| ends.min(limit));
-        self.session.answer(message, &Call { deadline }).await
+        let call = Call { caller: self.pass.caller().clone(), deadline };
+        self.session.answer(message, &call).await
     }
 }

@@ -14,14 +14,14 @@ use vbar_proto::{
     v1::guidance_service_server::GuidanceServiceServer,
 };
 
-use super::{TransportOptions, deadline_fault};
+use super::{Role, TransportOptions, deadline_fault, pass};
 use crate::{
     service::{Call, Error, Service},
     telemetry::RequestId,
     wire::{Parse, parse},
 };
 
-pub(super) use status::complete;
+pub(super) use status::{complete, refused, too_slow};
 
 /// Tells those who wait that the node is about to stop.
 pub(crate) type Draining = watch::Receiver<bool>;
@@ -50,6 +50,9 @@ pub(super) async fn router(service: &Arc<Service>, options: &TransportOptions) -
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
+    if options.role == Role::Worker {
+        return Routes::new(health).into_axum_router();
+    }
     let largest = options.request_bytes_max;
     Routes::new(GuidanceServiceServer::new(grpc.clone()).max_decoding_message_size(largest))
         .add_service(OperationsServer::new(grpc).max_decoding_message_size(largest))
@@ -75,7 +78,7 @@ impl Grpc {
         answer.await.map_err(|error| status::render(error, &id))
     }
 
-    /// The call's deadline.
+    /// Who asks, and the call's deadline.
     fn head<T>(&self, request: &Request<T>) -> Result<Call, Error> {
         let wish = match request.metadata().get("grpc-timeout") {
             None => None,
@@ -90,7 +93,8 @@ impl Grpc {
                 Some(timeout.ok_or_else(fault)?)
             }
         };
-        Ok(Call { deadline: self.service.deadline(wish) })
+        let caller = pass(request.extensions())?.caller().clone();
+        Ok(Call { caller, deadline: self.service.deadline(wish) })
     }
 }
 
@@ -99,7 +103,7 @@ fn request_id<T>(request: &Request<T>) -> RequestId {
 }
 
 /// The value of `grpc-timeout`.
-fn timeout(text: &str) -> Option<Duration> {
+pub(super) fn timeout(text: &str) -> Option<Duration> {
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|c| c.is_ascii_digit()) {
         return None;

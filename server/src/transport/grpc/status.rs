@@ -1,7 +1,9 @@
 //! Errors as gRPC statuses with `google.rpc` details.
 
-use std::collections::HashMap;
+use std::{collections::HashMap, time::Duration};
 
+use ::http::Response;
+use axum::body::Body;
 use prost::Message as _;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
@@ -17,7 +19,7 @@ use crate::{
 pub(super) fn render(error: Error, id: &RequestId) -> Status {
     let code = Code::from(error.code.number());
     let mut details = ErrorDetails::new();
-    details.set_error_info(error.reason, ERROR_DOMAIN, HashMap::new());
+    details.set_error_info(error.reason, ERROR_DOMAIN, metadata(id));
     details.set_request_info(&*id.0, "");
     if !error.violations.is_empty() {
         let violation = |violation: &Violation| FieldViolation {
@@ -34,6 +36,22 @@ pub(super) fn render(error: Error, id: &RequestId) -> Status {
     Status::with_error_details(code, error.message, details)
 }
 
+/// The answer to a request that is not let in.
+pub(in crate::transport) fn refused(error: Error, id: &RequestId) -> Response<Body> {
+    render(error, id).into_http()
+}
+
+/// The status of a request whose message did not arrive within `longest`; [`complete`] adds to it
+/// what every error says.
+pub(in crate::transport) fn too_slow(longest: Duration) -> Status {
+    Status::deadline_exceeded(format!("the request's message did not arrive within {longest:?}"))
+}
+
+/// What every error says besides its reason: the trace in which it happened.
+fn metadata(id: &RequestId) -> HashMap<String, String> {
+    HashMap::from([("trace_id".to_owned(), id.trace_id().as_str().to_owned())])
+}
+
 /// A status that the gRPC library made itself (a message it could not read, a method it does not
 /// know), with the details that our own have.
 pub(in crate::transport) fn complete(status: Status, id: &RequestId) -> Status {
@@ -43,11 +61,12 @@ pub(in crate::transport) fn complete(status: Status, id: &RequestId) -> Status {
     let reason = match status.code() {
         Code::InvalidArgument => "MALFORMED_MESSAGE",
         Code::OutOfRange => "REQUEST_TOO_LARGE",
+        Code::DeadlineExceeded => "REQUEST_TOO_SLOW",
         Code::Unimplemented => "METHOD_UNKNOWN",
         _ => "TRANSPORT",
     };
     let mut details = ErrorDetails::new();
-    details.set_error_info(reason, ERROR_DOMAIN, HashMap::new());
+    details.set_error_info(reason, ERROR_DOMAIN, metadata(id));
     details.set_request_info(&*id.0, "");
     Status::with_error_details(status.code(), status.message(), details)
 }

@@ -57,7 +57,7 @@ fn entity_tag(answer: &DownloadAnswer) -> String {
 }
 
 /// One range of bytes; anything else in the header means the whole, as the RFC allows.
-fn range(header: &str) -> Option<Range> {
+pub(super) fn range(header: &str) -> Option<Range> {
     let (first, last) = header.strip_prefix("bytes=")?.split_once('-')?;
     let number = |text: &str| {
         let is_number = !text.is_empty() && text.bytes().all(|c| c.is_ascii_digit());

@@ -34,6 +34,8 @@ impl From<Error> for HttpError {
             }
             Code::NotFound => StatusCode::NOT_FOUND,
             Code::AlreadyExists => StatusCode::CONFLICT,
+            Code::PermissionDenied => StatusCode::FORBIDDEN,
+            Code::Unauthenticated => StatusCode::UNAUTHORIZED,
             Code::ResourceExhausted => StatusCode::TOO_MANY_REQUESTS,
             // Nobody is left to read it; the number is the customary one.
             Code::Cancelled => StatusCode::from_u16(499).unwrap_or(StatusCode::BAD_REQUEST),
@@ -93,6 +95,10 @@ impl HttpError {
         let mut response = (self.status, [(header::CONTENT_TYPE, JSON)], body).into_response();
         response.extensions_mut().insert(AnsweredWith(self.error.code.number()));
         let headers = response.headers_mut();
+        if self.status == StatusCode::UNAUTHORIZED {
+            let scheme = HeaderValue::from_static("Bearer realm=\"vbar\"");
+            headers.insert(header::WWW_AUTHENTICATE, scheme);
+        }
         if let Some(allow) = self.allow {
             headers.insert(header::ALLOW, HeaderValue::from_static(allow));
         }
@@ -115,6 +121,7 @@ fn body(error: &Error, id: &RequestId) -> Value {
             "@type": format!("{TYPES}.ErrorInfo"),
             "reason": error.reason,
             "domain": ERROR_DOMAIN,
+            "metadata": { "trace_id": id.trace_id().as_str() },
         }),
         json!({ "@type": format!("{TYPES}.RequestInfo"), "requestId": &*id.0 }),
     ];
@@ -152,6 +159,11 @@ pub(super) async fn method_not_allowed(request: Request<Body>) -> Response {
         message,
     )
     .render(&request_id(&request))
+}
+
+/// The request is not let in.
+pub(in crate::transport) fn refused(error: Error, id: &RequestId) -> Response {
+    HttpError::from(error).render(id)
 }
 
 /// The path does not exist.

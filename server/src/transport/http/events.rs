@@ -14,6 +14,7 @@ use futures_util::stream;
 
 use super::{HttpError, json};
 use crate::{
+    access::Pass,
     service::{Error, Watching},
     telemetry::RequestId,
     wire::{OperationAnswer, Render as _},
@@ -26,12 +27,18 @@ const PAUSE: Duration = Duration::from_millis(200);
 /// A proxy must not take a quiet stream for a dead one.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
-/// Events until the operation is done, the node ends or the stream has lived its life.
-pub(super) fn answer(watching: Watching) -> Response {
+/// Events until the operation is done, the node ends, the caller may no longer see them or the
+/// stream has lived its life.
+pub(super) fn answer(watching: Watching, pass: Pass) -> Response {
     let until = Instant::now() + LIFE;
-    let events = stream::unfold((watching, true), move |(mut watching, is_first)| async move {
+    let events = stream::unfold(Some((watching, pass, true)), move |open| async move {
+        let (mut watching, pass, is_first) = open?;
         let answer = watching.next(is_first, PAUSE, until).await?;
-        Some((Ok::<_, Infallible>(event(answer)), (watching, false)))
+        let (answer, open) = match pass.holds() {
+            Ok(()) => (answer, Some((watching, pass, false))),
+            Err(refusal) => (Err(refusal.into()), None),
+        };
+        Some((Ok::<_, Infallible>(event(answer)), open))
     });
     Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response()
 }

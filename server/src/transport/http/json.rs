@@ -4,14 +4,19 @@ use prost::{Message, Name};
 use prost_reflect::{DeserializeOptions, DynamicMessage, MessageDescriptor, SerializeOptions};
 use vbar_proto::DESCRIPTORS;
 
+use super::distinct;
 use crate::service::{Code, Error};
 
-/// Reads a message; unknown fields are refused, the first fault is named with line and column.
-pub(super) fn decode<M: Message + Name + Default>(text: &[u8]) -> Result<M, Error> {
+/// Reads a message; unknown fields and fields given twice are refused, the first fault is named
+/// with line and column.
+pub(crate) fn decode<M: Message + Name + Default>(text: &[u8]) -> Result<M, Error> {
     let options = DeserializeOptions::new().deny_unknown_fields(true);
     let mut reader = serde_json::Deserializer::from_slice(text);
-    let read = DynamicMessage::deserialize_with_options(descriptor::<M>(), &mut reader, &options)
-        .and_then(|message| reader.end().map(|()| message));
+    let read = distinct::fields(text).and_then(|()| {
+        let message =
+            DynamicMessage::deserialize_with_options(descriptor::<M>(), &mut reader, &options)?;
+        reader.end().map(|()| message)
+    });
     let message = read.map_err(|fault| {
         Error::new(Code::InvalidArgument, "MALFORMED_JSON", format!("malformed JSON: {fault}"))
     })?;
@@ -20,7 +25,7 @@ pub(super) fn decode<M: Message + Name + Default>(text: &[u8]) -> Result<M, Erro
 
 /// Writes a message; fields with default values are written too, so that a reader need not know
 /// the contract to see a `false` or a 0.
-pub(super) fn encode<M: Message + Name>(message: &M) -> Vec<u8> {
+pub(crate) fn encode<M: Message + Name>(message: &M) -> Vec<u8> {
     let options = SerializeOptions::new().skip_default_fields(false);
     let mut dynamic = DynamicMessage::new(descriptor::<M>());
     dynamic.transcode_from(message).expect("a message fits its own descriptor");
@@ -64,6 +69,7 @@ mod tests {
             ("{\"elapsedS\": 1", "EOF"),
             ("{\"elapsedS\": NaN}", "line 1 column"),
             ("{\"elapsedS\": 1} x", "trailing"),
+            ("{\"elapsedS\": 1,\n\"elapsed_s\": 1}", "line 2"),
             ("", "EOF"),
         ] {
             let fault = decode::<v1::Measurement>(text.as_bytes()).unwrap_err();

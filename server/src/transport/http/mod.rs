@@ -1,10 +1,14 @@
 //! JSON over HTTP: the messages of the contract as canonical proto3 JSON.
 
+mod distinct;
 mod download;
 mod errors;
 mod events;
 mod json;
 mod openapi;
+
+#[cfg(feature = "fuzzing")]
+pub(crate) use json::{decode as decode_json, encode as encode_json};
 
 use std::{sync::Arc, time::Duration};
 
@@ -20,7 +24,7 @@ use http_body_util::{BodyExt as _, LengthLimitError, Limited};
 use prost::{Message, Name};
 use vbar_proto::{google::longrunning, v1};
 
-use super::{SERVER_TIMING, TransportOptions, deadline_fault, server_timing};
+use super::{Role, SERVER_TIMING, TransportOptions, deadline_fault, pass, server_timing};
 use crate::{
     service::{Call, Code, Error, Service, Timed},
     telemetry::RequestId,
@@ -28,7 +32,7 @@ use crate::{
 };
 use errors::HttpError;
 
-pub(super) use errors::unknown_path;
+pub(super) use errors::{refused, unknown_path};
 pub(super) use openapi::served;
 
 const JSON: HeaderValue = HeaderValue::from_static("application/json");
@@ -55,6 +59,21 @@ pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Rout
         options: options.clone(),
         openapi: openapi::document().to_string().into(),
     });
+    let router = match options.role {
+        Role::Node => calls(),
+        Role::Worker => Router::new(),
+    };
+    router
+        .route("/healthz", get(async || text(StatusCode::OK, "alive\n")))
+        .route("/readyz", get(ready))
+        .route("/readyz/steps", get(ready_for_steps))
+        .route("/metrics", get(metrics))
+        .method_not_allowed_fallback(errors::method_not_allowed)
+        .with_state(http)
+}
+
+/// Routes of calls.
+fn calls() -> Router<Arc<Http>> {
     Router::new()
         .route("/v1/plans:compute", post(compute_plan))
         .route("/v1/plans", get(list_plans).post(upload_plan))
@@ -67,12 +86,7 @@ pub(super) fn router(service: &Arc<Service>, options: &TransportOptions) -> Rout
         .route("/v1/step", post(step))
         .route("/v1/safety:report", post(safety_report))
         .route("/v1/info", get(info))
-        .route("/healthz", get(async || text(StatusCode::OK, "alive\n")))
-        .route("/readyz", get(ready))
-        .route("/metrics", get(metrics))
         .route("/openapi.json", get(openapi))
-        .method_not_allowed_fallback(errors::method_not_allowed)
-        .with_state(http)
 }
 
 async fn compute_plan(State(http): Shared, request: Request) -> Response {
@@ -239,8 +253,9 @@ async fn operation(State(http): Shared, Path(segment): Path<String>, request: Re
             }
             (&Method::GET, "watch") => {
                 no_query(&parts)?;
-                let (ask, _) = http.parsed(&parts, &by_name)?;
-                Ok(events::answer(http.service.watch_operation(ask)?))
+                let (ask, call) = http.parsed(&parts, &by_name)?;
+                let watching = http.service.watch_operation(ask, call).await?;
+                Ok(events::answer(watching, pass(&parts.extensions)?.clone()))
             }
             (_, "") => Err(HttpError::method_not_allowed("GET,HEAD,DELETE")),
             (_, "watch") => Err(HttpError::method_not_allowed("GET")),
@@ -252,9 +267,25 @@ async fn operation(State(http): Shared, Path(segment): Path<String>, request: Re
 
 async fn ready(State(http): Shared) -> Response {
     if *http.options.draining.borrow() {
-        return text(StatusCode::SERVICE_UNAVAILABLE, "shutting down\n");
+        return shutting_down();
+    }
+    match http.service.store_fault().await {
+        None => text(StatusCode::OK, "ready\n"),
+        Some(fault) => text(StatusCode::SERVICE_UNAVAILABLE, format!("{fault}\n")),
+    }
+}
+
+/// A store that several nodes share is gone for all of them at once. Whoever distributes calls must
+/// not take them all out for that: they still answer steps with artifacts that they remember.
+async fn ready_for_steps(State(http): Shared) -> Response {
+    if *http.options.draining.borrow() {
+        return shutting_down();
     }
     text(StatusCode::OK, "ready\n")
+}
+
+fn shutting_down() -> Response {
+    text(StatusCode::SERVICE_UNAVAILABLE, "shutting down\n")
 }
 
 async fn metrics(State(http): Shared) -> Response {
@@ -265,8 +296,8 @@ async fn openapi(State(http): Shared) -> Response {
     ([(header::CONTENT_TYPE, JSON)], http.openapi.clone()).into_response()
 }
 
-fn text(status: StatusCode, text: &'static str) -> Response {
-    (status, [(header::CONTENT_TYPE, TEXT)], text).into_response()
+fn text(status: StatusCode, text: impl Into<Body>) -> Response {
+    (status, [(header::CONTENT_TYPE, TEXT)], text.into()).into_response()
 }
 
 fn empty() -> Response {
@@ -337,17 +368,15 @@ impl Http {
         let wish = match parts.headers.get(TIMEOUT) {
             None => None,
             Some(value) => {
-                let text = value.to_str().ok().filter(|text| text.len() <= 9);
                 let expected = "a whole number of milliseconds above 0, up to 9 digits";
-                let milliseconds = text
-                    .filter(|text| text.bytes().all(|c| c.is_ascii_digit()))
-                    .and_then(|text| text.parse().ok())
-                    .filter(|&milliseconds| milliseconds > 0)
-                    .ok_or_else(|| deadline_fault(TIMEOUT, expected, value))?;
-                Some(Duration::from_millis(milliseconds))
+                let wish = value.to_str().ok().and_then(timeout);
+                Some(wish.ok_or_else(|| deadline_fault(TIMEOUT, expected, value))?)
             }
         };
-        let call = Call { deadline: self.service.deadline(wish) };
+        let call = Call {
+            caller: pass(&parts.extensions)?.caller().clone(),
+            deadline: self.service.deadline(wish),
+        };
         Ok((parse(message, &self.service.limits()).map_err(Error::from)?, call))
     }
 
@@ -371,6 +400,27 @@ impl Http {
             Err(_) => Err(HttpError::too_slow(self.options.receive_time_max)),
         }
     }
+}
+
+/// The value of `request-timeout-ms`.
+fn timeout(text: &str) -> Option<Duration> {
+    let is_number = text.len() <= 9 && text.bytes().all(|c| c.is_ascii_digit());
+    let milliseconds = is_number.then(|| text.parse().ok()).flatten();
+    milliseconds.filter(|&milliseconds| milliseconds > 0).map(Duration::from_millis)
+}
+
+/// Reads what is read by hand of the head of a request over HTTP.
+#[cfg(feature = "fuzzing")]
+pub(super) fn read_head(parts: &Parts) {
+    let text = |name: &str| parts.headers.get(name).and_then(|value| value.to_str().ok());
+    if let Some(wish) = text(TIMEOUT).and_then(timeout) {
+        assert!(!wish.is_zero() && wish.as_millis() < 1_000_000_000, "a deadline of {wish:?}");
+    }
+    text(header::RANGE.as_str()).map(download::range);
+    let json = is_json(&parts.headers);
+    assert!(json.is_err() || parts.headers.contains_key(header::CONTENT_TYPE), "no type is JSON");
+    assert!(no_query(parts).is_err() || query(parts).is_empty(), "a query was overlooked");
+    let _ = (page(parts), list_request(parts), export_request("", parts));
 }
 
 /// Only JSON, and only as it is: a compressed body could be a bomb.

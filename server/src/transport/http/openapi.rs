@@ -10,6 +10,7 @@ use serde_json::{Map, Value, json};
 use vbar_proto::DESCRIPTORS;
 
 use super::TIMEOUT;
+use crate::access::{Right, right};
 
 /// One HTTP binding of an RPC.
 struct Route {
@@ -73,19 +74,30 @@ const fn bare(method: &'static str, path: &'static str, rpc: &'static str) -> Ro
     Route { method, path, rpc, body: None }
 }
 
-/// What is served beside the contract: path, what it says, in which form.
-const PROBES: [(&str, &str, &str); 4] = [
-    ("/healthz", "Whether the process is alive.", "text/plain"),
-    ("/readyz", "Whether it will answer; 503 while it shuts down.", "text/plain"),
-    ("/metrics", "Metrics for Prometheus.", "application/openmetrics-text"),
-    ("/openapi.json", "This document.", "application/json"),
+/// What is served beside the contract: path, name, what it says, in which form.
+const BESIDE: [(&str, &str, &str, &str); 5] = [
+    ("/healthz", "probe", "Whether the process is alive.", "text/plain"),
+    (
+        "/readyz",
+        "probe",
+        "Whether it will answer; 503 while it shuts down or its store is gone.",
+        "text/plain",
+    ),
+    (
+        "/readyz/steps",
+        "probe",
+        "Whether it will answer steps; 503 while it shuts down.",
+        "text/plain",
+    ),
+    ("/metrics", "metrics", "Metrics for Prometheus.", "application/openmetrics-text"),
+    ("/openapi.json", "openapi", "This document.", "application/json"),
 ];
 
-/// Name of the RPC behind a request, `probe` for what is beside the contract; `None` if the path
+/// Name of the RPC behind a request, or of what is beside the contract; `None` if the path
 /// is not served. A method that the path does not take still belongs to the path.
 pub(in crate::transport) fn served(method: &Method, path: &str) -> Option<&'static str> {
-    if PROBES.iter().any(|(probe, ..)| *probe == path) {
-        return Some("probe");
+    if let Some((_, name, ..)) = BESIDE.iter().find(|(beside, ..)| *beside == path) {
+        return Some(name);
     }
     let method = if method == Method::HEAD { &Method::GET } else { method };
     let matching = ROUTES.iter().filter(|route| route.takes(path));
@@ -116,7 +128,7 @@ pub(super) fn document() -> Value {
         let operation = operation(route, &mut schemas);
         paths.entry(route.path.to_owned()).or_default().insert(route.method.to_owned(), operation);
     }
-    for (path, summary, content) in PROBES {
+    for (path, _, summary, content) in BESIDE {
         paths.entry(path.to_owned()).or_default().insert("get".to_owned(), probe(summary, content));
     }
     schemas.add_status();
@@ -132,7 +144,9 @@ pub(super) fn document() -> Value {
             "license": { "name": "Apache-2.0", "identifier": "Apache-2.0" },
         },
         "paths": paths,
+        "security": [{}, { "bearer": [] }],
         "components": {
+            "securitySchemes": { "bearer": { "type": "http", "scheme": "bearer" } },
             "schemas": schemas.by_name,
             "parameters": {
                 "id": {
@@ -184,9 +198,13 @@ fn operation(route: &Route, schemas: &mut Schemas) -> Value {
         parameters.push(json!({ "name": "Range", "in": "header", "schema": schema }));
     }
     let comments = Comments::of(&rpc.parent_file());
+    let mut description = comments.at(rpc.path());
+    if let Right::Role(role) = right(rpc.name()) {
+        description.push_str(&format!("\n\nNeeds the role `{}`.", role.name()));
+    }
     let mut operation = json!({
         "operationId": if route.path == WATCH { "WatchOperation" } else { rpc.name() },
-        "description": comments.at(rpc.path()),
+        "description": description,
         "parameters": parameters,
         "responses": responses(route, schemas.reference(&rpc.output())),
     });
@@ -227,6 +245,8 @@ fn responses(route: &Route, answer: Value) -> Value {
     let status = json!({ "$ref": "#/components/schemas/google.rpc.Status" });
     let mut errors = vec![
         ("400", "The request is at fault; every faulty field is named."),
+        ("401", "The node asks who calls: a token or certificate is missing, unknown or expired."),
+        ("403", "The caller does not have the role that the call needs."),
         ("405", "The path exists, but not for this method."),
         ("429", "A limit of the server is reached; the details say when to ask again."),
         ("500", "A bug of the server; the request id finds it in the log."),
