@@ -6,22 +6,37 @@
 
 use std::{fmt, net::SocketAddr, path::PathBuf, thread, time::Duration};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
-use crate::wire::{Limits, PLAN_INSTANTS_MAX};
+pub use listing::{ListedSetting, Sources};
+
+use crate::{
+    access::{AccessOptions, OptionFault},
+    recording::RecordingOptions,
+    store::without_user,
+    wire::{Limits, PLAN_INSTANTS_MAX},
+};
+
+pub use crate::store::NatsLocation;
 
 /// Everything a node needs to know.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
     /// Where to listen; port 0 takes any free one.
     pub listen: SocketAddr,
-    /// Listen beyond loopback although there is no authentication.
+    /// Listen beyond loopback although callers are not asked who they are, or say so in clear.
     pub allow_insecure_listen: bool,
-    /// Computations at once.
+    /// Computations at once: so many steps, and beside them, with less of the machine, one plan
+    /// fewer but at least one.
     pub compute_threads: usize,
-    /// How long a call may wait for a compute thread before it is told to come back.
+    /// How long a step may wait for a compute thread before it is told to come back.
     pub compute_wait: Duration,
-    /// How many calls may wait at once.
+    /// The same once a call had to be refused, until none was for a tenth of a second; meanwhile no
+    /// more than four calls wait for each thread.
+    pub compute_overload_wait: Duration,
+    /// How long a plan, a report, or anything else that no spacecraft waits for may wait.
+    pub compute_patient_wait: Duration,
+    /// How many calls may wait at once, of steps, plans and records each.
     pub compute_waiting_max: usize,
     /// Longest computation, whatever the caller's deadline.
     pub computation_time_max: Duration,
@@ -61,6 +76,10 @@ pub struct Config {
     pub artifact_bytes_max: u64,
     /// Callers that follow operations as events at once.
     pub watchers_max: usize,
+    /// Who may ask, and how much.
+    pub access: AccessOptions,
+    /// What is recorded of it.
+    pub recording: RecordingOptions,
     /// Limits on what a request may ask for.
     pub limits: Limits,
 }
@@ -73,8 +92,10 @@ pub enum StoreLocation {
         /// Most bytes.
         bytes_max: usize,
     },
-    /// In a directory.
+    /// In a directory, which this node has for itself.
     Directory(PathBuf),
+    /// On NATS JetStream, where other nodes and workers use it too.
+    Nats(NatsLocation),
 }
 
 const DAY: Duration = Duration::from_secs(24 * 3600);
@@ -85,7 +106,9 @@ impl Default for Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             allow_insecure_listen: false,
             compute_threads: thread::available_parallelism().map_or(1, usize::from),
-            compute_wait: Duration::from_millis(50),
+            compute_wait: Duration::from_millis(20),
+            compute_overload_wait: Duration::from_millis(5),
+            compute_patient_wait: Duration::from_secs(1),
             compute_waiting_max: 256,
             computation_time_max: Duration::from_secs(60),
             request_bytes_max: 4 << 20,
@@ -105,6 +128,8 @@ impl Default for Config {
             artifact_lifetime: 30 * DAY,
             artifact_bytes_max: 16 << 30,
             watchers_max: 64,
+            access: AccessOptions::default(),
+            recording: RecordingOptions::default(),
             limits: Limits::default(),
         }
     }
@@ -127,8 +152,15 @@ impl fmt::Display for ConfigFault {
     }
 }
 
+impl From<OptionFault> for ConfigFault {
+    fn from(OptionFault { setting, expected, got }: OptionFault) -> Self {
+        Self { setting, expected, got }
+    }
+}
+
 impl Config {
-    /// Everything that is wrong; empty if a node can start with it.
+    /// Everything that is wrong, the files with credentials included; empty if a node can start
+    /// with it.
     #[must_use]
     pub fn faults(&self) -> Vec<ConfigFault> {
         let mut faults = Vec::new();
@@ -137,10 +169,12 @@ impl Config {
                 faults.push(ConfigFault { setting, expected: expected.to_owned(), got });
             }
         };
+        let is_secure = self.access.is_encrypted() && self.access.is_authenticated();
         check(
-            self.listen.ip().is_loopback() || self.allow_insecure_listen,
+            self.listen.ip().is_loopback() || is_secure || self.allow_insecure_listen,
             "listen",
-            "a loopback address, or allow_insecure_listen (there is no authentication)",
+            "a loopback address, or TLS (tls_certificate) with tokens_file or tls_client_ca, or \
+             allow_insecure_listen",
             self.listen.to_string(),
         );
         let mut count = |setting, value: usize, max: usize| {
@@ -151,7 +185,15 @@ impl Config {
         count("request_bytes_max", self.request_bytes_max, 1 << 30);
         count("connections_max", self.connections_max, 1 << 20);
         count("streams_max", usize::try_from(self.streams_max).unwrap_or(usize::MAX), 1 << 16);
-        count("job_threads", self.job_threads, 1024);
+        match &self.store {
+            // Workers can do all of it.
+            StoreLocation::Nats(nats) => {
+                count("job_threads", self.job_threads + 1, 1025);
+                count("store_replicas", nats.replicas, 5);
+                count("tasks_max", nats.tasks_max, 10_000_000);
+            }
+            _ => count("job_threads", self.job_threads, 1024),
+        }
         count("jobs_unfinished_max", self.jobs_unfinished_max, 100_000);
         let attempts = usize::try_from(self.job_attempts_max).unwrap_or(usize::MAX);
         count("job_attempts_max", attempts, 1_000_000);
@@ -166,12 +208,15 @@ impl Config {
         count("limits.report_states_max", self.limits.report_states_max, 1_000_000);
         count("limits.sampled_rows_max", self.limits.sampled_rows_max, 100_000_000);
         count("limits.plant_vertices_max", self.limits.plant_vertices_max, 4096);
+        count("limits.problem_bytes_max", self.limits.problem_bytes_max, 1 << 46);
         let mut time = |setting, value: Duration, (least, most): (Duration, Duration)| {
             let expected = format!("{least:?} to {most:?}");
             check((least..=most).contains(&value), setting, &expected, format!("{value:?}"));
         };
         let (tick, hour) = (Duration::from_millis(1), Duration::from_secs(3600));
         time("compute_wait", self.compute_wait, (Duration::ZERO, hour));
+        time("compute_overload_wait", self.compute_overload_wait, (Duration::ZERO, hour));
+        time("compute_patient_wait", self.compute_patient_wait, (Duration::ZERO, hour));
         time("computation_time_max", self.computation_time_max, (tick, hour));
         time("receive_time_max", self.receive_time_max, (tick, hour));
         time("shutdown_grace", self.shutdown_grace, (Duration::ZERO, hour));
@@ -179,15 +224,70 @@ impl Config {
         time("job_time_max", self.job_time_max, (tick, 30 * DAY));
         time("operation_lifetime", self.operation_lifetime, (tick, 3650 * DAY));
         time("artifact_lifetime", self.artifact_lifetime, (tick, 3650 * DAY));
-        if let StoreLocation::Memory { bytes_max } = self.store {
-            check(bytes_max > 0, "store_bytes_max", "at least 1", bytes_max.to_string());
+        match &self.store {
+            StoreLocation::Memory { bytes_max } => {
+                check(*bytes_max > 0, "store_bytes_max", "at least 1", bytes_max.to_string());
+            }
+            StoreLocation::Directory(_) => {}
+            StoreLocation::Nats(nats) => {
+                let second = Duration::from_secs(1);
+                let mut time = |setting, value: Duration, least: Duration| {
+                    let expected = format!("{least:?} to {hour:?}");
+                    check(
+                        (least..=hour).contains(&value),
+                        setting,
+                        &expected,
+                        format!("{value:?}"),
+                    );
+                };
+                time("job_lease", nats.lease_term, second);
+                time("store_patience", nats.patience, tick);
+                for server in &nats.servers {
+                    let rest = ["nats://", "tls://"].iter().find_map(|s| server.strip_prefix(s));
+                    let expected =
+                        "nats://HOST:PORT or tls://HOST:PORT, several with commas between";
+                    let good = rest.is_some_and(|rest| !rest.is_empty());
+                    check(good, "store", expected, without_user(server));
+                }
+                let is_word = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+                let good = (1..=32).contains(&nats.name.len()) && nats.name.chars().all(is_word);
+                let expected = "up to 32 letters, digits, - and _";
+                check(good, "store_name", expected, nats.name.clone());
+            }
+        }
+        let (least, most) = (RecordingOptions::BYTES_MIN, RecordingOptions::BYTES_MAX);
+        let bytes_max = self.recording.bytes_max;
+        let expected = format!("{least} to {most}");
+        check(
+            (least..=most).contains(&bytes_max),
+            "record_bytes_max",
+            &expected,
+            bytes_max.to_string(),
+        );
+        faults.extend(self.access.faults().into_iter().map(ConfigFault::from));
+        faults
+    }
+}
+
+impl Config {
+    /// What is wrong with it for a worker only.
+    #[must_use]
+    pub fn worker_faults(&self) -> Vec<ConfigFault> {
+        let mut faults = Vec::new();
+        if !matches!(self.store, StoreLocation::Nats(_)) {
+            let expected = "nats://HOST:PORT: a worker does the jobs of others".to_owned();
+            let got = "a store of its own".to_owned();
+            faults.push(ConfigFault { setting: "store", expected, got });
+        } else if self.job_threads == 0 {
+            let expected = "1 to 1024".to_owned();
+            faults.push(ConfigFault { setting: "job_threads", expected, got: "0".to_owned() });
         }
         faults
     }
 }
 
 /// What one source of configuration says; durations in seconds.
-#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs, reason = "each is the field of the same name in `Config` or `Limits`")]
 pub struct Settings {
@@ -195,6 +295,8 @@ pub struct Settings {
     pub allow_insecure_listen: Option<bool>,
     pub compute_threads: Option<usize>,
     pub compute_wait_s: Option<f64>,
+    pub compute_overload_wait_s: Option<f64>,
+    pub compute_patient_wait_s: Option<f64>,
     pub compute_waiting_max: Option<usize>,
     pub computation_time_max_s: Option<f64>,
     pub request_bytes_max: Option<usize>,
@@ -202,8 +304,16 @@ pub struct Settings {
     pub streams_max: Option<u32>,
     pub receive_time_max_s: Option<f64>,
     pub shutdown_grace_s: Option<f64>,
-    /// Directory of the artifact store; absent: in memory.
+    /// Directory of the artifact store; absent: in memory, or where `store` says.
     pub store_directory: Option<PathBuf>,
+    /// `nats://host:port` of one or, with commas between, several servers.
+    pub store: Option<String>,
+    pub store_credentials: Option<PathBuf>,
+    pub store_name: Option<String>,
+    pub store_replicas: Option<usize>,
+    pub store_patience_s: Option<f64>,
+    pub job_lease_s: Option<f64>,
+    pub tasks_max: Option<usize>,
     /// Most bytes of a store in memory.
     pub store_bytes_max: Option<usize>,
     pub store_sync: Option<bool>,
@@ -217,6 +327,19 @@ pub struct Settings {
     pub artifact_lifetime_s: Option<f64>,
     pub artifact_bytes_max: Option<u64>,
     pub watchers_max: Option<usize>,
+    pub tls_certificate: Option<PathBuf>,
+    pub tls_key: Option<PathBuf>,
+    pub tls_client_ca: Option<PathBuf>,
+    pub tokens_file: Option<PathBuf>,
+    pub credentials_poll_s: Option<f64>,
+    pub caller_rate_max_per_s: Option<f64>,
+    pub caller_burst_max: Option<u32>,
+    pub caller_calls_max: Option<u32>,
+    pub caller_connections_max: Option<u32>,
+    pub audit_file: Option<PathBuf>,
+    pub record_file: Option<PathBuf>,
+    pub record_bytes_max: Option<u64>,
+    pub record_answers: Option<bool>,
     pub horizon_max: Option<usize>,
     pub generators_max: Option<usize>,
     pub states_max: Option<usize>,
@@ -227,6 +350,7 @@ pub struct Settings {
     pub report_states_max: Option<usize>,
     pub sampled_rows_max: Option<usize>,
     pub plant_vertices_max: Option<usize>,
+    pub problem_bytes_max: Option<usize>,
 }
 
 /// Why a source of configuration could not be read.
@@ -243,7 +367,7 @@ pub enum SettingsError {
     Durations(Vec<String>),
 }
 
-/// Expands `$body!(field)` for every setting.
+/// Expands `$body!(field, …)` with every setting.
 macro_rules! for_each_setting {
     ($body:ident) => {
         $body!(
@@ -251,6 +375,8 @@ macro_rules! for_each_setting {
             allow_insecure_listen,
             compute_threads,
             compute_wait_s,
+            compute_overload_wait_s,
+            compute_patient_wait_s,
             compute_waiting_max,
             computation_time_max_s,
             request_bytes_max,
@@ -259,6 +385,13 @@ macro_rules! for_each_setting {
             receive_time_max_s,
             shutdown_grace_s,
             store_directory,
+            store,
+            store_credentials,
+            store_name,
+            store_replicas,
+            store_patience_s,
+            job_lease_s,
+            tasks_max,
             store_bytes_max,
             store_sync,
             cache_bytes_max,
@@ -271,6 +404,19 @@ macro_rules! for_each_setting {
             artifact_lifetime_s,
             artifact_bytes_max,
             watchers_max,
+            tls_certificate,
+            tls_key,
+            tls_client_ca,
+            tokens_file,
+            credentials_poll_s,
+            caller_rate_max_per_s,
+            caller_burst_max,
+            caller_calls_max,
+            caller_connections_max,
+            audit_file,
+            record_file,
+            record_bytes_max,
+            record_answers,
             horizon_max,
             generators_max,
             states_max,
@@ -280,10 +426,14 @@ macro_rules! for_each_setting {
             plan_instants_max,
             report_states_max,
             sampled_rows_max,
-            plant_vertices_max
+            plant_vertices_max,
+            problem_bytes_max
         )
     };
 }
+
+// Behind the macro, which it uses.
+mod listing;
 
 impl Settings {
     /// From the text of a TOML file.
@@ -356,10 +506,23 @@ impl Settings {
                 default
             }),
         };
-        let store = match (self.store_directory, self.store_bytes_max) {
-            (Some(directory), _) => StoreLocation::Directory(directory),
-            (None, Some(bytes_max)) => StoreLocation::Memory { bytes_max },
-            (None, None) => config.store,
+        let store = match (self.store, self.store_directory, self.store_bytes_max) {
+            (Some(servers), _, _) => {
+                let servers = servers.split(',').map(|server| server.trim().to_owned());
+                let default = NatsLocation::at(servers.collect());
+                StoreLocation::Nats(NatsLocation {
+                    credentials: self.store_credentials.or(default.credentials),
+                    name: self.store_name.unwrap_or(default.name),
+                    replicas: self.store_replicas.unwrap_or(default.replicas),
+                    lease_term: time("job_lease_s", self.job_lease_s, default.lease_term),
+                    patience: time("store_patience_s", self.store_patience_s, default.patience),
+                    tasks_max: self.tasks_max.unwrap_or(default.tasks_max),
+                    servers: default.servers,
+                })
+            }
+            (None, Some(directory), _) => StoreLocation::Directory(directory),
+            (None, None, Some(bytes_max)) => StoreLocation::Memory { bytes_max },
+            (None, None, None) => config.store,
         };
         let applied = Config {
             listen: self.listen.unwrap_or(config.listen),
@@ -368,6 +531,16 @@ impl Settings {
                 .unwrap_or(config.allow_insecure_listen),
             compute_threads: self.compute_threads.unwrap_or(config.compute_threads),
             compute_wait: time("compute_wait_s", self.compute_wait_s, config.compute_wait),
+            compute_overload_wait: time(
+                "compute_overload_wait_s",
+                self.compute_overload_wait_s,
+                config.compute_overload_wait,
+            ),
+            compute_patient_wait: time(
+                "compute_patient_wait_s",
+                self.compute_patient_wait_s,
+                config.compute_patient_wait,
+            ),
             compute_waiting_max: self.compute_waiting_max.unwrap_or(config.compute_waiting_max),
             computation_time_max: time(
                 "computation_time_max_s",
@@ -407,6 +580,31 @@ impl Settings {
             ),
             artifact_bytes_max: self.artifact_bytes_max.unwrap_or(config.artifact_bytes_max),
             watchers_max: self.watchers_max.unwrap_or(config.watchers_max),
+            access: AccessOptions {
+                tls_certificate: self.tls_certificate.or(config.access.tls_certificate),
+                tls_key: self.tls_key.or(config.access.tls_key),
+                tls_client_ca: self.tls_client_ca.or(config.access.tls_client_ca),
+                tokens_file: self.tokens_file.or(config.access.tokens_file),
+                credentials_poll: time(
+                    "credentials_poll_s",
+                    self.credentials_poll_s,
+                    config.access.credentials_poll,
+                ),
+                caller_rate_max_per_s: self
+                    .caller_rate_max_per_s
+                    .unwrap_or(config.access.caller_rate_max_per_s),
+                caller_burst_max: self.caller_burst_max.unwrap_or(config.access.caller_burst_max),
+                caller_calls_max: self.caller_calls_max.unwrap_or(config.access.caller_calls_max),
+                caller_connections_max: self
+                    .caller_connections_max
+                    .unwrap_or(config.access.caller_connections_max),
+                audit_file: self.audit_file.or(config.access.audit_file),
+            },
+            recording: RecordingOptions {
+                file: self.record_file.or(config.recording.file),
+                bytes_max: self.record_bytes_max.unwrap_or(config.recording.bytes_max),
+                answers: self.record_answers.unwrap_or(config.recording.answers),
+            },
             limits: Limits {
                 horizon_max: self.horizon_max.unwrap_or(config.limits.horizon_max),
                 generators_max: self.generators_max.unwrap_or(config.limits.generators_max),
@@ -426,6 +624,9 @@ impl Settings {
                 plant_vertices_max: self
                     .plant_vertices_max
                     .unwrap_or(config.limits.plant_vertices_max),
+                problem_bytes_max: self
+                    .problem_bytes_max
+                    .unwrap_or(config.limits.problem_bytes_max),
             },
         };
         if faults.is_empty() { Ok(applied) } else { Err(SettingsError::Durations(faults)) }

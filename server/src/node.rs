@@ -3,31 +3,40 @@
 use std::{
     convert::Infallible,
     io,
-    net::SocketAddr,
+    net::{IpAddr, SocketAddr},
+    path::Path,
     sync::{Arc, Weak},
     time::Duration,
 };
 
 use crate::{
-    compute::Compute,
+    access::{Gate, OptionFault, Peer},
+    compute::{Compute, ComputeLimits},
     config::{Config, ConfigFault, StoreLocation},
-    service::Service,
-    store::{DirectoryStore, MemoryStore, Store, StoreError, Syncing},
-    telemetry::Metrics,
-    transport::{Front, TransportOptions},
-    wire::InfoAnswer,
+    recording::{Recorder, Session},
+    service::{OpenStore, Service},
+    store::{DirectoryStore, MemoryStore, NatsStore, StoreError, Syncing},
+    telemetry::{Metrics, OutcomeLabels},
+    transport::{Front, Role, TransportOptions},
+    wire::{BUILD, InfoAnswer},
 };
 use axum::body::Body;
 use hyper_util::{
     rt::{TokioExecutor, TokioIo, TokioTimer},
-    server::{conn::auto, graceful::GracefulShutdown},
+    server::{
+        conn::auto,
+        graceful::{GracefulShutdown, Watcher},
+    },
 };
+use rustls::ServerConfig;
 use tokio::{
+    io::{AsyncRead, AsyncReadExt as _, AsyncWrite},
     net::{TcpListener, TcpStream},
     sync::{Semaphore, watch},
     task::{JoinHandle, JoinSet},
     time::timeout,
 };
+use tokio_rustls::TlsAcceptor;
 
 /// A running server.
 #[derive(Debug)]
@@ -35,6 +44,8 @@ pub struct Node {
     local_address: SocketAddr,
     draining: watch::Sender<bool>,
     service: Arc<Service>,
+    gate: Arc<Gate>,
+    recorder: Option<Arc<Recorder>>,
     shutdown_grace: Duration,
     task: JoinHandle<()>,
 }
@@ -71,7 +82,23 @@ impl Node {
     /// # Errors
     /// [`StartError`]; nothing runs then.
     pub async fn start(config: Config) -> Result<Self, StartError> {
-        let faults = config.faults();
+        Self::start_as(Role::Node, config).await
+    }
+
+    /// Starts to do parts of jobs that nodes with the same store take orders for. On its port it
+    /// tells only how it is.
+    ///
+    /// # Errors
+    /// [`StartError`], also if the store is not one that others reach; nothing runs then.
+    pub async fn start_worker(config: Config) -> Result<Self, StartError> {
+        Self::start_as(Role::Worker, config).await
+    }
+
+    async fn start_as(role: Role, config: Config) -> Result<Self, StartError> {
+        let mut faults = config.faults();
+        if role == Role::Worker {
+            faults.extend(config.worker_faults());
+        }
         if !faults.is_empty() {
             return Err(StartError::Config(faults));
         }
@@ -80,13 +107,29 @@ impl Node {
         let listener = TcpListener::bind(address).await.map_err(refused)?;
         let local_address = listener.local_addr().map_err(refused)?;
         let metrics = Arc::new(Metrics::new());
-        let compute = Compute::start(
-            config.compute_threads,
-            config.compute_wait,
-            config.compute_waiting_max,
-            Arc::clone(&metrics),
-        )
-        .map_err(StartError::Threads)?;
+        let gate = {
+            let (options, metrics) = (config.access.clone(), Arc::clone(&metrics));
+            let open = move || Gate::open(options, metrics);
+            let opened = tokio::task::spawn_blocking(open).await;
+            let failed =
+                |fault: tokio::task::JoinError| StartError::Threads(io::Error::other(fault));
+            let named = |faults: Vec<OptionFault>| faults.into_iter().map(Into::into).collect();
+            Arc::new(opened.map_err(failed)?.map_err(|faults| StartError::Config(named(faults)))?)
+        };
+        tokio::spawn(reload(Arc::downgrade(&gate), gate.poll()));
+        let recorder = {
+            let (config, metrics) = (config.clone(), Arc::clone(&metrics));
+            let opened = tokio::task::spawn_blocking(move || recorder(&config, metrics)).await;
+            opened.map_err(|fault| StartError::Threads(io::Error::other(fault)))??
+        };
+        let limits = ComputeLimits {
+            threads: config.compute_threads,
+            wait_max: config.compute_wait,
+            overload_wait_max: config.compute_overload_wait,
+            patient_wait_max: config.compute_patient_wait,
+            waiting_max: config.compute_waiting_max,
+        };
+        let compute = Compute::start(limits, Arc::clone(&metrics)).map_err(StartError::Threads)?;
         let info = InfoAnswer {
             limits: config.limits,
             request_bytes_max: config.request_bytes_max,
@@ -113,13 +156,15 @@ impl Node {
             request_bytes_max: config.request_bytes_max,
             receive_time_max: config.receive_time_max,
             draining: drain.clone(),
+            role,
         };
-        let front = Front::new(Arc::clone(&service), options).await;
+        let front =
+            Front::new(Arc::clone(&service), Arc::clone(&gate), recorder.clone(), options).await;
         tracing::info!(%local_address, "listening");
         let shutdown_grace = config.shutdown_grace;
-        let port = Port { front, metrics, config };
+        let port = Port { front, gate: Arc::clone(&gate), metrics, config };
         let task = tokio::spawn(port.serve(listener, drain));
-        Ok(Self { local_address, draining, service, shutdown_grace, task })
+        Ok(Self { local_address, draining, service, gate, recorder, shutdown_grace, task })
     }
 
     /// Where it listens.
@@ -141,14 +186,51 @@ impl Node {
         if let Err(fault) = ended {
             tracing::error!(%fault, "the node did not stop well");
         }
+        let (gate, recorder) = (self.gate, self.recorder);
+        let close = move || {
+            gate.audit().close();
+            if let Some(recorder) = recorder {
+                recorder.close();
+            }
+        };
+        if let Err(fault) = tokio::task::spawn_blocking(close).await {
+            tracing::error!(%fault, "closing the audit file and the recording");
+        }
     }
 }
 
-fn store(config: &Config) -> Result<Arc<dyn Store>, StoreError> {
+/// Opens the recording, if there is to be one; blocks.
+fn recorder(config: &Config, metrics: Arc<Metrics>) -> Result<Option<Arc<Recorder>>, StartError> {
+    let session = Session {
+        build_version: BUILD.version.to_owned(),
+        build_sha256: BUILD.sha256.to_owned(),
+        settings: config.answering().to_toml(),
+        ..Session::default()
+    };
+    let opened = Recorder::open(&config.recording, session, metrics).map_err(|fault| {
+        let path = config.recording.file.as_deref().unwrap_or(Path::new("")).display();
+        StartError::Config(vec![ConfigFault {
+            setting: "record_file",
+            expected: "a file that can be written".to_owned(),
+            got: format!("{path}: {fault}"),
+        }])
+    })?;
+    Ok(opened.map(Arc::new))
+}
+
+/// Opens the store; blocks.
+fn store(config: &Config) -> Result<OpenStore, StoreError> {
     let syncing = if config.store_sync { Syncing::EveryWrite } else { Syncing::LeftToTheSystem };
     Ok(match &config.store {
-        StoreLocation::Memory { bytes_max } => Arc::new(MemoryStore::new(*bytes_max)),
-        StoreLocation::Directory(root) => Arc::new(DirectoryStore::open(root, syncing)?),
+        StoreLocation::Memory { bytes_max } => {
+            OpenStore::Own(Arc::new(MemoryStore::new(*bytes_max)))
+        }
+        StoreLocation::Directory(root) => {
+            OpenStore::Own(Arc::new(DirectoryStore::open(root, syncing)?))
+        }
+        StoreLocation::Nats(location) => {
+            OpenStore::Shared(Arc::new(NatsStore::connect(location.clone())?))
+        }
     })
 }
 
@@ -165,9 +247,21 @@ async fn sweep(service: Weak<Service>, rest: Duration) {
     }
 }
 
+/// Reads the credentials again now and then for as long as the gate stands.
+async fn reload(gate: Weak<Gate>, rest: Duration) {
+    loop {
+        tokio::time::sleep(rest).await;
+        let Some(gate) = gate.upgrade() else { return };
+        if let Err(fault) = tokio::task::spawn_blocking(move || gate.reload()).await {
+            tracing::error!(%fault, "reading the credentials again");
+        }
+    }
+}
+
 /// Accepts connections.
 struct Port {
     front: Front,
+    gate: Arc<Gate>,
     metrics: Arc<Metrics>,
     config: Config,
 }
@@ -185,19 +279,21 @@ impl Port {
                 _ = draining.wait_for(|draining| *draining) => break,
             };
             match accepted {
-                Ok((stream, _)) => match Arc::clone(&slots).try_acquire_owned() {
-                    Ok(slot) => {
-                        let connection = self.connection(stream, graceful.watcher());
-                        while connections.try_join_next().is_some() {}
-                        connections.spawn(async move {
-                            connection.await;
-                            drop(slot);
-                        });
-                    }
-                    Err(_) => {
+                Ok((stream, peer)) => {
+                    let address = peer.ip();
+                    let place = self.gate.connection(address);
+                    let Some(places) = place.zip(Arc::clone(&slots).try_acquire_owned().ok())
+                    else {
                         self.metrics.connections_refused.inc();
-                    }
-                },
+                        continue;
+                    };
+                    let connection = self.connection(stream, address, graceful.watcher());
+                    while connections.try_join_next().is_some() {}
+                    connections.spawn(async move {
+                        connection.await;
+                        drop(places);
+                    });
+                }
                 // Out of file descriptors, or a connection gone before it was accepted: wait a
                 // little rather than spin.
                 Err(fault) => {
@@ -216,32 +312,48 @@ impl Port {
     fn connection(
         &self,
         stream: TcpStream,
-        watcher: hyper_util::server::graceful::Watcher,
+        address: IpAddr,
+        watcher: Watcher,
     ) -> impl Future<Output = ()> + Send + 'static {
         let builder = self.builder();
         let front = self.front.clone();
         let metrics = Arc::clone(&self.metrics);
         let receive_time_max = self.config.receive_time_max;
+        let tls = self.gate.tls();
         async move {
             metrics.connections.inc();
-            let _open = Open(metrics);
+            let _open = Open(Arc::clone(&metrics));
             // Small answers must not wait for one another's acknowledgements.
             if let Err(fault) = stream.set_nodelay(true) {
                 tracing::debug!(%fault, "TCP_NODELAY");
             }
-            let builder = match timeout(receive_time_max, speaks_http2(&stream)).await {
-                Ok(Ok(true)) => builder.http2_only(),
-                Ok(Ok(false)) => builder.http1_only(),
-                // Gone, or silent for too long.
-                Ok(Err(_)) | Err(_) => return,
-            };
-            let answer = hyper::service::service_fn(move |request: hyper::Request<_>| {
-                let front = front.clone();
-                async move { Ok::<_, Infallible>(front.answer(request.map(Body::new)).await) }
-            });
-            let connection = builder.serve_connection(TokioIo::new(stream), answer);
-            if let Err(fault) = watcher.watch(connection.into_owned()).await {
-                tracing::debug!(%fault, "connection");
+            // Gone, or silent for too long: nobody is left to tell.
+            match tls {
+                None => {
+                    let begin = timeout(receive_time_max, speaks_http2(&stream)).await;
+                    let Ok(Ok(is_http2)) = begin else { return };
+                    let peer = Peer::new(address, None);
+                    serve(builder, is_http2, stream, peer, front, watcher).await;
+                }
+                Some(tls) => {
+                    let begin = timeout(receive_time_max, encrypted(stream, tls)).await;
+                    let outcome = match &begin {
+                        Ok(Ok(_)) => "completed",
+                        Ok(Err(_)) => "failed",
+                        Err(_) => "slow",
+                    };
+                    metrics.tls_handshakes.get_or_create(&OutcomeLabels { outcome }).inc();
+                    let (stream, is_http2, certificate) = match begin {
+                        Ok(Ok(begun)) => begun,
+                        Ok(Err(fault)) => {
+                            tracing::debug!(%fault, %address, "TLS");
+                            return;
+                        }
+                        Err(_) => return,
+                    };
+                    let peer = Peer::new(address, certificate.as_deref());
+                    serve(builder, is_http2, stream, peer, front, watcher).await;
+                }
             }
         }
     }
@@ -270,11 +382,13 @@ impl Port {
     }
 }
 
+/// The preface of HTTP/2.
+const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+
 /// Whether a connection begins with the preface of HTTP/2 (RFC 9113, sec. 3.4).
 ///
 /// Looked at here and not by the HTTP library, because it would wait for a preface for ever.
 async fn speaks_http2(stream: &TcpStream) -> io::Result<bool> {
-    const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
     let mut begin = [0; PREFACE.len()];
     loop {
         let length = stream.peek(&mut begin).await?;
@@ -289,6 +403,55 @@ async fn speaks_http2(stream: &TcpStream) -> io::Result<bool> {
         }
         // The rest of a preface that came in pieces; peeking again gives the same bytes at once.
         tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+/// A connection that was encrypted, whether it speaks HTTP/2, and the caller's certificate in DER.
+///
+/// It has already said something: a caller that is silent after the handshake does not get here.
+async fn encrypted(
+    stream: TcpStream,
+    config: Arc<ServerConfig>,
+) -> io::Result<(impl AsyncRead + AsyncWrite + Send + Unpin + 'static, bool, Option<Vec<u8>>)> {
+    let mut stream = TlsAcceptor::from(config).accept(stream).await?;
+    let (_, session) = stream.get_ref();
+    let is_http2 = session.alpn_protocol() == Some(b"h2");
+    let certificate = session.peer_certificates().and_then(|chain| Some(chain.first()?.to_vec()));
+    let mut begin = vec![0; PREFACE.len()];
+    // Any first byte will do for HTTP/1, whose head has a time limit of its own; HTTP/2 has none
+    // for its preface.
+    let least = if is_http2 { begin.len() } else { 1 };
+    let mut length = 0;
+    while length < least {
+        match stream.read(&mut begin[length..]).await? {
+            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
+            more => length += more,
+        }
+    }
+    begin.truncate(length);
+    let (reader, writer) = tokio::io::split(stream);
+    let whole = tokio::io::join(io::Cursor::new(begin).chain(reader), writer);
+    Ok((whole, is_http2, certificate))
+}
+
+/// Answers the requests of one connection until it ends.
+async fn serve(
+    builder: auto::Builder<TokioExecutor>,
+    is_http2: bool,
+    stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    peer: Peer,
+    front: Front,
+    watcher: Watcher,
+) {
+    let builder = if is_http2 { builder.http2_only() } else { builder.http1_only() };
+    let peer = Arc::new(peer);
+    let answer = hyper::service::service_fn(move |request: hyper::Request<_>| {
+        let (front, peer) = (front.clone(), Arc::clone(&peer));
+        async move { Ok::<_, Infallible>(front.answer(request.map(Body::new), &peer).await) }
+    });
+    let connection = builder.serve_connection(TokioIo::new(stream), answer);
+    if let Err(fault) = watcher.watch(connection.into_owned()).await {
+        tracing::debug!(%fault, "connection");
     }
 }
 

@@ -82,7 +82,7 @@ async fn grpc_health_serves_until_shutdown() {
 }
 
 /// Calls `path` with bytes as they are.
-async fn raw_call(server: &Server, path: &'static str, body: &[u8]) -> tonic::Status {
+pub(crate) async fn raw_call(server: &Server, path: &'static str, body: &[u8]) -> tonic::Status {
     /// Any message: what it decodes does not matter.
     #[derive(Clone, PartialEq, prost::Message)]
     struct Raw {}

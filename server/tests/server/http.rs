@@ -135,6 +135,7 @@ async fn http_probes_answer() {
     let server = server().await;
     assert_eq!(server.get("/healthz").await.text(), "alive\n");
     assert_eq!(server.get("/readyz").await.text(), "ready\n");
+    assert_eq!(server.get("/readyz/steps").await.text(), "ready\n");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -166,7 +167,7 @@ async fn http_openapi_lists_every_route_and_only_those() {
     let document = server.get("/openapi.json").await.json();
     assert_eq!(document["openapi"], "3.1.0");
     let paths = document["paths"].as_object().unwrap();
-    assert_eq!(paths.len(), 20);
+    assert_eq!(paths.len(), 21);
     let id = "0".repeat(64);
     for (path, methods) in paths {
         for method in methods.as_object().unwrap().keys() {

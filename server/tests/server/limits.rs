@@ -4,16 +4,20 @@ use std::time::Duration;
 
 use ::http::Method;
 use bytes::Bytes;
+use serde_json::json;
 use tokio::{
     io::{AsyncReadExt as _, AsyncWriteExt as _},
-    net::TcpStream,
+    net::{TcpSocket, TcpStream},
     time::timeout,
 };
 use tonic::Code;
 use vbar_proto::v1;
-use vbar_server::{Config, Node, StartError};
+use vbar_server::{AccessOptions, Config, Node, StartError};
 
-use crate::support::{server, server_with};
+use crate::{
+    missions::integrator,
+    support::{Server, detail, server, server_with},
+};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn limits_body_of_100_mb_is_refused_unread_over_http() {
@@ -86,23 +90,49 @@ async fn limits_slow_heads_and_bodies_are_dropped() {
     assert!(half_a_body.starts_with("HTTP/1.1 408"), "{half_a_body}");
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn limits_idle_connections_leave_room_when_they_end() {
-    let server = server_with(Config { connections_max: 3, ..Config::default() }).await;
+/// So many connections, surely accepted: each has sent half a head.
+async fn half_a_head_each(server: &Server, count: usize) -> Vec<TcpStream> {
     let mut held = Vec::new();
-    for _ in 0..3 {
+    for _ in 0..count {
         let mut stream = TcpStream::connect(server.address).await.unwrap();
-        // Half a head, so that the connection is surely accepted before the next.
         stream.write_all(b"GET /healthz HTTP/1.1\r\n").await.unwrap();
         held.push(stream);
     }
     tokio::time::sleep(Duration::from_millis(100)).await;
+    held
+}
+
+/// The next connection is closed or reset, without a byte.
+async fn ends_without_a_word(server: &Server) {
     let mut refused = TcpStream::connect(server.address).await.unwrap();
     let mut nothing = Vec::new();
     let read = timeout(Duration::from_secs(5), refused.read_to_end(&mut nothing));
-    // Closed or reset, without a byte.
     let _ = read.await.expect("the connection ends");
     assert_eq!(nothing, b"");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn limits_one_address_cannot_hold_every_connection() {
+    let access = AccessOptions { caller_connections_max: 2, ..AccessOptions::default() };
+    let server = server_with(Config { access, ..Config::default() }).await;
+    let _held = half_a_head_each(&server, 2).await;
+    ends_without_a_word(&server).await;
+    // From another address of this machine there is room.
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.bind("127.0.0.2:0".parse().unwrap()).unwrap();
+    let mut other = socket.connect(server.address).await.unwrap();
+    let request = b"GET /healthz HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n";
+    other.write_all(request).await.unwrap();
+    let mut answer = String::new();
+    other.read_to_string(&mut answer).await.unwrap();
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn limits_idle_connections_leave_room_when_they_end() {
+    let server = server_with(Config { connections_max: 3, ..Config::default() }).await;
+    let held = half_a_head_each(&server, 3).await;
+    ends_without_a_word(&server).await;
     drop(held);
     tokio::time::sleep(Duration::from_millis(100)).await;
     assert_eq!(server.get("/healthz").await.status, 200);
@@ -147,4 +177,33 @@ async fn limits_shutdown_closes_the_port() {
     let address = server.address;
     timeout(Duration::from_secs(5), server.node.shutdown()).await.expect("nothing is under way");
     assert!(TcpStream::connect(address).await.is_err());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn limits_problem_that_would_take_too_much_memory_is_refused_before_it_takes_any() {
+    let limits = vbar_server::Limits { problem_bytes_max: 1 << 20, ..Default::default() };
+    let server = server_with(Config { limits, ..Config::default() }).await;
+    // 100,000 rows of 13 numbers and more, twice.
+    let mut problem = integrator();
+    problem["offlineSampling"]["samples"]["size"] = 20_000.into();
+    for (path, request) in [
+        ("/v1/precompute", json!({ "problem": problem })),
+        ("/v1/precompute", json!({ "problem": problem, "validateOnly": true })),
+        ("/v1/plans:compute", json!({ "problem": problem })),
+    ] {
+        let answer = server.post(path, &request).await;
+        assert_eq!(answer.status, 400, "{}", answer.text());
+        let error = answer.json();
+        let bad = detail(&error, "BadRequest").expect("it names the field");
+        let violation = bad["fieldViolations"].as_array().and_then(|all| all.first());
+        let violation = violation.expect("a violation");
+        assert_eq!(violation["field"], "problem.offline_sampling");
+        let description = violation["description"].as_str().expect("a text");
+        assert!(description.contains("at most about 1 MiB"), "{description}");
+    }
+    let small = json!({ "problem": integrator() });
+    let mut small_enough = small.clone();
+    small_enough["problem"]["offlineSampling"]["samples"]["size"] = 20.into();
+    let answer = server.post("/v1/precompute", &small_enough).await;
+    assert_eq!(answer.status, 200, "{}", answer.text());
 }

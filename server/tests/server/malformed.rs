@@ -196,6 +196,13 @@ async fn malformed_motion_of_the_target_is_named() {
         let problem = with(missions::envisat(), ROTATION, Some(rotation));
         check(&server, &case, &problem, &[&format!("{PATH}.torque_free.{field}")]).await;
     }
+    // Half an hour of integration, if it were tried.
+    let fast = with(free, "/angularVelocityBodyDegS", Some(json!([0, 0, 1e7])));
+    let problem = with(missions::envisat(), ROTATION, Some(json!({ "torqueFree": fast })));
+    let request = json!({ "problem": problem, "measurement": missions::envisat_start() });
+    let answer = server.post("/v1/step", &request).await;
+    assert_eq!(answer.status, 400, "{}", answer.json());
+    assert_eq!(json_fields(&answer.json()), [format!("{PATH}.torque_free")]);
     let table = json!({ "rows": 2, "columns": 3, "values": [1, 0, 0, 1, 0, 0] });
     let sampled = json!({ "sampled": { "capturePointsM": table, "captureVelocitiesMS": table } });
     let problem = with(missions::envisat(), ROTATION, Some(sampled));

@@ -5,7 +5,8 @@ use vbar_server::{Config, Limits};
 
 use crate::{
     malformed::{check, with},
-    offline_sampling::{baseline, finished, hill, integrator, poseidyn},
+    missions::integrator,
+    offline_sampling::{baseline, finished, hill, poseidyn},
     support::{detail, server, server_with},
 };
 

@@ -132,6 +132,61 @@ pub(crate) fn prisma_measurement(k: u32) -> Value {
     })
 }
 
+/// A row-major matrix.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn matrix(rows: &[&[f64]]) -> Value {
+    let values: Vec<f64> = rows.iter().flat_map(|row| row.iter().copied()).collect();
+    json!({ "rows": rows.len(), "columns": rows[0].len(), "values": values })
+}
+
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn diagonal(entries: &[f64]) -> Value {
+    let n = entries.len();
+    let mut values = vec![0.0; n * n];
+    entries.iter().enumerate().for_each(|(i, entry)| values[i * n + i] = *entry);
+    json!({ "rows": n, "columns": n, "values": values })
+}
+
+/// |x_i| <= sizes[i], for the components from `first` on of `n`.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn symmetric(n: usize, first: usize, sizes: &[f64]) -> Value {
+    let mut values = vec![0.0; 2 * sizes.len() * n];
+    for i in 0..sizes.len() {
+        values[i * n + first + i] = 1.0;
+        values[(sizes.len() + i) * n + first + i] = -1.0;
+    }
+    json!({
+        "normals": { "rows": 2 * sizes.len(), "columns": n, "values": values },
+        "offsets": ([sizes, sizes].concat()),
+    })
+}
+
+/// A double integrator of uncertain strength with a set of first steps.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
+pub(crate) fn integrator() -> Value {
+    let column = matrix(&[&[0.5], &[1.0]]);
+    let uniform = json!({ "uniform": { "low": -0.02, "high": 0.02 } });
+    json!({ "offlineSampling": {
+        "polynomial": {
+            "a": { "constant": matrix(&[&[1.0, 1.0], &[0.0, 1.0]]) },
+            "b": { "constant": column, "terms": [{ "powers": [1], "matrix": column }] },
+            "parameters": [{ "uniform": { "low": -0.1, "high": 0.1 } }],
+            "discretisation": "DISCRETISATION_NONE",
+        },
+        "disturbance": [uniform, uniform],
+        "scheme": "OFFLINE_SAMPLING_SCHEME_OFFLINE_SAMPLING",
+        "horizon": 4,
+        "gain": { "lqr": { "state": diagonal(&[1.0, 1.0]), "input": diagonal(&[0.5]) } },
+        "weights": { "state": diagonal(&[1.0, 1.0]), "input": diagonal(&[0.5]), "samples": 100 },
+        "stateSet": symmetric(2, 0, &[4.0, 1.5]),
+        "inputSet": symmetric(1, 0, &[1.0]),
+        "samples": { "violation": 0.05, "confidenceComplement": 1e-3, "size": 200 },
+        "redundancy": { "exact": {} },
+        "firstStepSet": { "rounds": 20, "directions": 40, "facetsMax": 300 },
+        "seed": "11",
+    } })
+}
+
 /// The message that `json` writes.
 pub(crate) fn message<M: prost::Message + prost::Name + Default>(json: Value) -> M {
     let message = DynamicMessage::deserialize(descriptor::<M>(), json);
@@ -151,11 +206,13 @@ fn descriptor<M: prost::Name>() -> MessageDescriptor {
 }
 
 /// The state that `prediction` says will be measured next if no disturbance acts.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
 pub(crate) fn predicted(answer: &v1::StepResponse, elapsed_s: f64) -> Value {
     predicted_after(answer, 1, elapsed_s)
 }
 
 /// The same, `steps` steps on.
+#[allow(dead_code, reason = "the benchmarks share this file and fly only EnviSat")]
 pub(crate) fn predicted_after(answer: &v1::StepResponse, steps: usize, elapsed_s: f64) -> Value {
     let prediction = answer.prediction.as_ref().expect("it was asked for");
     let row = |matrix: &Option<v1::Matrix>| {

@@ -8,60 +8,9 @@ use vbar_proto::v1::{self, artifact::Summary, step_response::Verdict};
 use vbar_server::Config;
 
 use crate::{
-    missions,
+    missions::{self, diagonal, integrator, matrix, symmetric},
     support::{Server, detail, grpc_fields, json_fields, server, server_with},
 };
-
-/// A row-major matrix.
-fn matrix(rows: &[&[f64]]) -> Value {
-    let values: Vec<f64> = rows.iter().flat_map(|row| row.iter().copied()).collect();
-    json!({ "rows": rows.len(), "columns": rows[0].len(), "values": values })
-}
-
-fn diagonal(entries: &[f64]) -> Value {
-    let n = entries.len();
-    let mut values = vec![0.0; n * n];
-    entries.iter().enumerate().for_each(|(i, entry)| values[i * n + i] = *entry);
-    json!({ "rows": n, "columns": n, "values": values })
-}
-
-/// |x_i| <= sizes[i], for the components from `first` on of `n`.
-fn symmetric(n: usize, first: usize, sizes: &[f64]) -> Value {
-    let mut values = vec![0.0; 2 * sizes.len() * n];
-    for i in 0..sizes.len() {
-        values[i * n + first + i] = 1.0;
-        values[(sizes.len() + i) * n + first + i] = -1.0;
-    }
-    json!({
-        "normals": { "rows": 2 * sizes.len(), "columns": n, "values": values },
-        "offsets": ([sizes, sizes].concat()),
-    })
-}
-
-/// A double integrator of uncertain strength with a set of first steps.
-pub(crate) fn integrator() -> Value {
-    let column = matrix(&[&[0.5], &[1.0]]);
-    let uniform = json!({ "uniform": { "low": -0.02, "high": 0.02 } });
-    json!({ "offlineSampling": {
-        "polynomial": {
-            "a": { "constant": matrix(&[&[1.0, 1.0], &[0.0, 1.0]]) },
-            "b": { "constant": column, "terms": [{ "powers": [1], "matrix": column }] },
-            "parameters": [{ "uniform": { "low": -0.1, "high": 0.1 } }],
-            "discretisation": "DISCRETISATION_NONE",
-        },
-        "disturbance": [uniform, uniform],
-        "scheme": "OFFLINE_SAMPLING_SCHEME_OFFLINE_SAMPLING",
-        "horizon": 4,
-        "gain": { "lqr": { "state": diagonal(&[1.0, 1.0]), "input": diagonal(&[0.5]) } },
-        "weights": { "state": diagonal(&[1.0, 1.0]), "input": diagonal(&[0.5]), "samples": 100 },
-        "stateSet": symmetric(2, 0, &[4.0, 1.5]),
-        "inputSet": symmetric(1, 0, &[1.0]),
-        "samples": { "violation": 0.05, "confidenceComplement": 1e-3, "size": 200 },
-        "redundancy": { "exact": {} },
-        "firstStepSet": { "rounds": 20, "directions": 40, "facetsMax": 300 },
-        "seed": "11",
-    } })
-}
 
 /// The floating spacecraft with few samples: what the paper does, small.
 pub(crate) fn poseidyn() -> Value {

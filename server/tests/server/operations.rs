@@ -14,7 +14,7 @@ use vbar_proto::{
     },
     v1,
 };
-use vbar_server::{Config, Node, StartError, StoreLocation};
+use vbar_server::{AccessOptions, Config, NewToken, Node, StartError, StoreLocation};
 
 use crate::{
     missions, offline_sampling,
@@ -322,6 +322,41 @@ async fn operations_have_limits() {
     let unknown = format!("/v1/operations/{}:watch", "ab".repeat(32));
     assert_eq!(server.get(&unknown).await.status, 404);
     assert_eq!(server.http(Method::POST, &path, &[], Bytes::new()).await.status, 405);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn events_end_when_the_token_of_their_caller_is_taken_away() {
+    let draw = || NewToken::draw("watch", &["precompute".to_owned()], None).ok().unwrap();
+    let (token, other) = (draw(), draw());
+    let folder = tempfile::tempdir().unwrap();
+    let tokens_file = folder.path().join("tokens.toml");
+    std::fs::write(&tokens_file, &token.entry).unwrap();
+    let access = AccessOptions {
+        tokens_file: Some(tokens_file.clone()),
+        credentials_poll: Duration::from_millis(20),
+        ..AccessOptions::default()
+    };
+    let server = server_with(Config { access, ..impatient() }).await;
+    let ask = async |method: Method, path: &str, token: &NewToken, body: String| {
+        let bearer = format!("Bearer {}", token.secret);
+        let headers = [("authorization", &*bearer), ("content-type", "application/json")];
+        server.http(method, path, &headers, body.into()).await
+    };
+    let problem = json!({ "problem": slow() }).to_string();
+    let begun = ask(Method::POST, "/v1/precompute", &token, problem).await;
+    let name = begun.json()["name"].as_str().unwrap().to_owned();
+    let path = format!("/v1/{name}:watch");
+    let watch = ask(Method::GET, &path, &token, String::new());
+    let (watched, ()) = tokio::join!(watch, async {
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        std::fs::write(&tokens_file, &other.entry).unwrap();
+    });
+    let (_, last) = watched.text().trim_end().rsplit_once("event:").unwrap();
+    assert!(last.trim_start().starts_with("error"), "{last}");
+    assert!(last.contains("CREDENTIAL_UNKNOWN"), "{last}");
+    let cancel = format!("/v1/{name}:cancel");
+    assert_eq!(ask(Method::POST, &cancel, &token, String::new()).await.status, 401);
+    assert_eq!(ask(Method::POST, &cancel, &other, String::new()).await.status, 200);
 }
 
 #[tokio::test(flavor = "multi_thread")]

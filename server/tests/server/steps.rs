@@ -152,7 +152,12 @@ async fn step_same_request_gives_the_same_bytes_with_1_and_2_threads() {
     // Four calls at once wait for one thread, however slow the machine is.
     let compute_wait = Duration::from_secs(20);
     for compute_threads in [1, 2] {
-        let config = Config { compute_threads, compute_wait, ..Config::default() };
+        let config = Config {
+            compute_threads,
+            compute_wait,
+            compute_patient_wait: compute_wait,
+            ..Config::default()
+        };
         let server = server_with(config).await;
         let problem = ("problem", missions::envisat());
         let request = step_request(problem, missions::envisat_start());
@@ -304,6 +309,7 @@ async fn step_busy_server_refuses_with_a_time_to_come_back() {
     let config = Config {
         compute_threads: 1,
         compute_wait: Duration::ZERO,
+        compute_patient_wait: Duration::ZERO,
         compute_waiting_max: 0,
         ..Config::default()
     };
@@ -340,12 +346,12 @@ async fn step_cancelled_call_stops_computing() {
     let whole = start.elapsed();
     drop(uninterrupted);
     let call = tokio::spawn(async move { client.step(request).await });
-    while server.metric("vbar_computations ").await == 0.0 && !call.is_finished() {
+    while server.metric("vbar_computations{").await == 0.0 && !call.is_finished() {
         tokio::time::sleep(Duration::from_micros(200)).await;
     }
     call.abort();
     let start = Instant::now();
-    while server.metric("vbar_computations ").await > 0.0 {
+    while server.metric("vbar_computations{").await > 0.0 {
         tokio::time::sleep(Duration::from_micros(200)).await;
     }
     assert!(start.elapsed() < whole.max(Duration::from_millis(50)));

@@ -127,11 +127,11 @@ impl Server {
         Answer { status: head.status, headers, body }
     }
 
-    /// The value of a metric; 0 if it never moved.
+    /// The value of a metric, of all its labels together; 0 if it never moved.
     pub(crate) async fn metric(&self, name: &str) -> f64 {
         let answer = self.get("/metrics").await;
-        let line = answer.text().lines().find(|line| line.starts_with(name)).map(str::to_owned);
-        line.and_then(|line| line.rsplit(' ').next()?.parse().ok()).unwrap_or(0.0)
+        let lines = answer.text().lines().filter(|line| line.starts_with(name));
+        lines.filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok()).sum()
     }
 }
 
