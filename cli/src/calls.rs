@@ -19,7 +19,7 @@ use crate::{
     json,
     mission::MissionArguments,
     plans::{self, PlanOptions},
-    session::{NodeArguments, Session},
+    session::{CredentialArguments, NodeArguments, Session},
 };
 
 /// Largest request that is read.
@@ -57,6 +57,8 @@ pub(crate) struct HealthArguments {
     /// URL of the node
     #[arg(long, value_name = "URL", env = "VBAR_SERVER", default_value = "http://127.0.0.1:7440")]
     server: String,
+    #[command(flatten)]
+    credentials: CredentialArguments,
     /// How long to wait for the answer
     #[arg(long, value_name = "SECONDS", default_value_t = 2)]
     timeout_s: u16,
@@ -109,7 +111,9 @@ pub(crate) async fn step(arguments: StepArguments) -> Result<(), Failure> {
 
 pub(crate) async fn health(arguments: HealthArguments) -> Result<(), Failure> {
     let time = Duration::from_secs(arguments.timeout_s.into());
-    let options = Options { deadline: time, connect_timeout: time, ..Options::default() };
+    let credentials = arguments.credentials.read()?;
+    let options =
+        Options { deadline: time, connect_timeout: time, credentials, ..Options::default() };
     let client = Client::connect(&arguments.server, options).await?;
     if client.is_serving().await? {
         json::print("serving")

@@ -4,6 +4,8 @@ use std::fmt;
 
 use vbar_client::{Code, Error};
 
+/// A comparison found a difference.
+const DIFFERENT: u8 = 1;
 /// Wrong command line or configuration.
 pub(crate) const USAGE: u8 = 64;
 /// A file that makes no sense, or a request that a node refused.
@@ -26,6 +28,10 @@ pub(crate) struct Failure {
 }
 
 impl Failure {
+    pub(crate) fn different(message: impl Into<String>) -> Self {
+        Self { code: DIFFERENT, message: message.into() }
+    }
+
     pub(crate) fn usage(message: impl Into<String>) -> Self {
         Self { code: USAGE, message: message.into() }
     }

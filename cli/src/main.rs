@@ -1,7 +1,7 @@
 //! The `vbar` command.
 //!
 //! Results go to standard output, everything else to standard error. Exit codes are those of
-//! `sysexits.h`: 64 for a wrong command line or configuration, 65 for a file that makes no sense,
+//! `sysexits.h` but for 1, a comparison that found a difference: 64 for a wrong command line or configuration, 65 for a file that makes no sense,
 //! 69 for a node that does not answer, 70 for a fault of ours.
 
 mod calls;
@@ -12,10 +12,13 @@ mod log;
 mod mission;
 mod plans;
 mod precompute;
+mod replay;
 mod safety;
 mod serve;
 mod session;
 mod simulate;
+mod token;
+mod version;
 
 use std::process::ExitCode;
 
@@ -41,6 +44,8 @@ struct Arguments {
 enum Command {
     /// Run a node that answers over the network
     Serve(serve::ServeArguments),
+    /// Do parts of the jobs that nodes with the same store take orders for
+    Worker(serve::ServeArguments),
     /// Fly a mission many times against a node and report what comes out
     Simulate(simulate::SimulateArguments),
     /// Compute a plan for a mission, print it, and write it as a file for others
@@ -57,6 +62,12 @@ enum Command {
     Safety(safety::SafetyArguments),
     /// Ask whether a node will answer; exit code 69 if not
     Health(calls::HealthArguments),
+    /// Make tokens for callers of a node that asks who they are
+    Token(token::TokenArguments),
+    /// Ask again what a node recorded, and compare the answers; exit code 1 if any differs
+    Replay(replay::ReplayArguments),
+    /// Say what this program, or a node, was built from
+    Version(version::VersionArguments),
 }
 
 fn main() -> ExitCode {
@@ -69,7 +80,11 @@ fn main() -> ExitCode {
             return ExitCode::from(code);
         }
     };
-    let filter = if matches!(arguments.command, Command::Serve(_)) { "info" } else { "warn" };
+    let filter = if matches!(arguments.command, Command::Serve(_) | Command::Worker(_)) {
+        "info"
+    } else {
+        "warn"
+    };
     match log::start(&arguments.log, filter).and_then(|()| run(arguments.command)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
@@ -87,6 +102,7 @@ fn run(command: Command) -> Result<(), Failure> {
     runtime.block_on(async {
         match command {
             Command::Serve(arguments) => serve::serve(arguments).await,
+            Command::Worker(arguments) => serve::work(arguments).await,
             Command::Simulate(arguments) => simulate::simulate(arguments).await,
             Command::Plan(arguments) => calls::plan(*arguments).await,
             Command::Verify(arguments) => plans::verify(&arguments),
@@ -95,6 +111,9 @@ fn run(command: Command) -> Result<(), Failure> {
             Command::Precompute(arguments) => precompute::precompute(arguments).await,
             Command::Safety(arguments) => safety::safety(arguments).await,
             Command::Health(arguments) => calls::health(arguments).await,
+            Command::Token(arguments) => token::token(&arguments),
+            Command::Replay(arguments) => replay::replay(arguments).await,
+            Command::Version(arguments) => version::version(arguments).await,
         }
     })
 }

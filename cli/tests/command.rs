@@ -1,7 +1,17 @@
 //! The command as its users see it: processes, exit codes, standard streams.
 
+#[path = "command/access.rs"]
+mod access;
 #[path = "command/crashes.rs"]
 mod crashes;
+#[cfg(target_os = "linux")]
+#[path = "command/flood.rs"]
+mod flood;
+#[path = "../../server/tests/server/missions.rs"]
+#[allow(dead_code, reason = "the tests of the server share this file and need more of it")]
+mod missions;
+#[path = "command/replay.rs"]
+mod replay;
 
 use std::{
     io::{BufRead as _, BufReader, Write as _},
@@ -130,6 +140,62 @@ fn serve_check_config_starts_nothing() {
     let bad = output(&["serve", "--check-config", "--config", "/nowhere/vbar.toml"]);
     assert_eq!(bad.status.code(), Some(64));
     assert!(text(&bad.stderr).contains("/nowhere/vbar.toml"));
+}
+
+#[test]
+fn serve_print_config_says_every_setting_and_where_it_was_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("vbar.toml");
+    let password = "nats://user:secret@127.0.0.1:4222";
+    std::fs::write(&file, format!("# ours\nhorizon_max = 77\nstore = '{password}'\n")).unwrap();
+    let file = file.to_str().unwrap();
+    let print = |arguments: &[&str]| {
+        let all = ["serve", "--print-config", "--config", file, "--compute-threads", "3"];
+        let printed =
+            vbar(&[&all[..], arguments].concat()).env("VBAR_STREAMS_MAX", "44").output().unwrap();
+        assert_eq!(printed.status.code(), Some(0), "{}", text(&printed.stderr));
+        assert!(!text(&printed.stdout).contains("secret"), "a password is shown");
+        text(&printed.stdout)
+    };
+    let plain = print(&[]);
+    for line in [
+        "compute_threads = 3  # flag".to_owned(),
+        "streams_max = 44  # environment VBAR_STREAMS_MAX".to_owned(),
+        format!("horizon_max = 77  # {file}:2"),
+        format!("store = \"nats://(set)@127.0.0.1:4222\"  # {file}:3"),
+        "listen = \"127.0.0.1:7440\"  # default".to_owned(),
+        "# tokens_file is not set".to_owned(),
+    ] {
+        assert!(plain.lines().any(|printed| printed == line), "{line} is not in\n{plain}");
+    }
+    let listed: Vec<Value> = serde_json::from_str(&print(&["--format", "json"])).unwrap();
+    assert_eq!(listed.len(), plain.lines().count());
+    let horizon = listed.iter().find(|setting| setting["name"] == "horizon_max").unwrap();
+    assert_eq!((&horizon["value"], &horizon["source"]), (&77.into(), &format!("{file}:2").into()));
+    // What is printed is a file of settings that says the same.
+    let printed = folder.path().join("printed.toml");
+    std::fs::write(&printed, &plain).unwrap();
+    let again = output(&["serve", "--print-config", "--config", printed.to_str().unwrap()]);
+    let values = |text: &str| -> Vec<String> {
+        text.lines().map(|line| line.split("  # ").next().unwrap().to_owned()).collect()
+    };
+    assert_eq!(values(&text(&again.stdout)), values(&plain), "{}", text(&again.stderr));
+}
+
+#[test]
+fn version_is_the_same_here_and_on_a_node() {
+    let node = Process::start(&[]);
+    let here = output(&["version", "--format", "json"]);
+    let there = output(&["version", "--format", "json", "--server", &node.url]);
+    assert_eq!(text(&here.stdout), text(&there.stdout), "{}", text(&there.stderr));
+    let build: Value = serde_json::from_slice(&here.stdout).unwrap();
+    assert_eq!(build["sha256"].as_str().unwrap().len(), 64);
+    assert!(build["rustc"].as_str().unwrap().starts_with("rustc 1."), "{build}");
+    for name in ["version", "target", "profile"] {
+        assert!(!build[name].as_str().unwrap().is_empty(), "{name} in {build}");
+    }
+    let plain = text(&output(&["version"]).stdout);
+    assert!(plain.contains(build["sha256"].as_str().unwrap()), "{plain}");
 }
 
 #[test]

@@ -50,7 +50,7 @@ impl Client {
     /// says they are; [`Error`], as every call.
     pub async fn download_artifact(&self, artifact_id: &str) -> Result<Bytes, Error> {
         let deadline = Instant::now() + self.options.deadline;
-        let mut attempts = Attempts::new(self.options.attempts_max, deadline);
+        let mut attempts = Attempts::new(self.options.attempts_max, deadline, &self.retries);
         let mut download = Download::default();
         loop {
             match attempts.bounded(self.fetch_rest(artifact_id, &mut download)).await {

@@ -5,6 +5,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tonic::{
     Code, Request, Response, Status,
+    service::interceptor::InterceptedService,
     transport::{Channel, Endpoint},
 };
 use tonic_health::pb::{
@@ -21,7 +22,14 @@ use vbar_proto::{
     },
 };
 
-use crate::{ClosedLoop, Error, retry::Attempts};
+use crate::{
+    ClosedLoop, Credentials, Error,
+    credentials::{self, Bearer},
+    retry::{Attempts, Retries},
+};
+
+/// A connection on which every call says who asks.
+pub(crate) type Transport = InterceptedService<Channel, Bearer>;
 
 /// How calls are made.
 #[derive(Debug, Clone)]
@@ -33,10 +41,16 @@ pub struct Options {
     pub precompute_deadline: Duration,
     /// Longest time to reach the node once.
     pub connect_timeout: Duration,
+    /// Longest time without a sign of life from the node while a call waits; then its connection is
+    /// given up, and the call is tried on another. Without it a connection that is gone and does not
+    /// say so would take the deadline of every call on it.
+    pub silence_max: Duration,
     /// Most attempts of one call, the first included; 0 counts as 1.
     pub attempts_max: u32,
     /// Largest message sent or accepted.
     pub message_bytes_max: usize,
+    /// Whom to believe, and how to say who asks.
+    pub credentials: Credentials,
 }
 
 impl Default for Options {
@@ -45,8 +59,10 @@ impl Default for Options {
             deadline: Duration::from_secs(30),
             precompute_deadline: Duration::from_secs(3600),
             connect_timeout: Duration::from_secs(5),
+            silence_max: Duration::from_secs(10),
             attempts_max: 5,
             message_bytes_max: 16 << 20,
+            credentials: Credentials::default(),
         }
     }
 }
@@ -54,21 +70,27 @@ impl Default for Options {
 /// A connection to one node; cheap to clone, and all clones share the connection.
 #[derive(Debug, Clone)]
 pub struct Client {
-    pub(crate) guidance: GuidanceServiceClient<Channel>,
-    pub(crate) operations: OperationsClient<Channel>,
-    health: HealthClient<Channel>,
+    pub(crate) guidance: GuidanceServiceClient<Transport>,
+    pub(crate) operations: OperationsClient<Transport>,
+    health: HealthClient<Transport>,
+    pub(crate) transport: Transport,
     pub(crate) options: Options,
+    pub(crate) retries: Retries,
 }
 
 impl Client {
-    /// Connects to the node at `url`, such as `http://127.0.0.1:7440`.
+    /// Connects to the node at `url`, such as `http://127.0.0.1:7440` or `https://node:7440`.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for a URL that is not `http://host:port`; `UNAVAILABLE` when nothing
-    /// answers there after all attempts.
+    /// `INVALID_ARGUMENT` for a URL that is not `http://host:port` or `https://host:port`, or
+    /// credentials that do not fit it; `UNAVAILABLE` when nothing answers there after all
+    /// attempts.
     pub async fn connect(url: &str, options: Options) -> Result<Self, Error> {
         let endpoint = endpoint(url, &options)?;
-        let mut attempts = Attempts::new(options.attempts_max, Instant::now() + options.deadline);
+        let bearer = Bearer::new(&options.credentials)?;
+        let retries = Retries::default();
+        let deadline = Instant::now() + options.deadline;
+        let mut attempts = Attempts::new(options.attempts_max, deadline, &retries);
         let channel = loop {
             let reached = async {
                 endpoint.connect().await.map_err(|fault| {
@@ -82,16 +104,19 @@ impl Client {
                 Err(error) => attempts.pause_after(error).await?,
             }
         };
+        let channel = InterceptedService::new(channel, bearer);
         let size = options.message_bytes_max;
         Ok(Self {
             guidance: GuidanceServiceClient::new(channel.clone())
                 .max_decoding_message_size(size)
                 .max_encoding_message_size(size),
             health: HealthClient::new(channel.clone()),
+            transport: channel.clone(),
             operations: OperationsClient::new(channel)
                 .max_decoding_message_size(size)
                 .max_encoding_message_size(size),
             options,
+            retries,
         })
     }
 
@@ -101,6 +126,12 @@ impl Client {
         let mut client = self.clone();
         client.options.deadline = deadline;
         client
+    }
+
+    /// How often this client and its clones tried again what the world had interrupted.
+    #[must_use]
+    pub fn retries(&self) -> u64 {
+        self.retries.count()
     }
 
     /// Computes a plan to fly without further optimisation, or says why there is none.
@@ -245,7 +276,8 @@ impl Client {
     where
         F: Future<Output = Result<Response<A>, Status>>,
     {
-        let mut attempts = Attempts::new(self.options.attempts_max, Instant::now() + within);
+        let deadline = Instant::now() + within;
+        let mut attempts = Attempts::new(self.options.attempts_max, deadline, &self.retries);
         loop {
             let mut message = Request::new(request.clone());
             message.set_timeout(attempts.time_left()?);
@@ -260,18 +292,33 @@ impl Client {
 
 fn endpoint(url: &str, options: &Options) -> Result<Endpoint, Error> {
     let refused = |why: String| {
-        Error::local(Code::InvalidArgument, format!("{why}; a node's URL is http://host:port"))
+        Error::local(
+            Code::InvalidArgument,
+            format!("{why}; a node's URL is http://host:port or https://host:port"),
+        )
     };
     let uri: http::Uri =
         url.parse().map_err(|fault| refused(format!("{url:?} is not a URL: {fault}")))?;
     match uri.scheme_str() {
-        Some("http") => {}
+        Some("http" | "https") => {}
         Some(other) => return Err(refused(format!("{other}:// is not spoken by this client"))),
         None => return Err(refused(format!("{url:?} has no scheme"))),
     }
     if uri.port_u16().is_none() || uri.path() != "/" || uri.query().is_some() {
         return Err(refused(format!("{url:?} has no port, or something after it")));
     }
+    let tls = credentials::tls(&uri, options)?;
     // A step is one small message and one small answer: waiting to fill a packet only delays.
-    Ok(Endpoint::from(uri).tcp_nodelay(true).connect_timeout(options.connect_timeout))
+    // Half of the silence passes before the node is asked, half before it must have answered.
+    let endpoint = Endpoint::from(uri)
+        .tcp_nodelay(true)
+        .connect_timeout(options.connect_timeout)
+        .http2_keep_alive_interval(options.silence_max / 2)
+        .keep_alive_timeout(options.silence_max / 2);
+    match tls {
+        None => Ok(endpoint),
+        Some(tls) => endpoint.tls_config(tls).map_err(|_| {
+            Error::local(Code::InvalidArgument, "the certificates or the key are not in PEM")
+        }),
+    }
 }

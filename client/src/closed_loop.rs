@@ -72,8 +72,9 @@ impl ClosedLoop {
     /// [`Error`], as every call. The loop stays usable: the next step goes on from the last
     /// decision that arrived.
     pub async fn step(&mut self, measurement: Measurement) -> Result<StepResponse, Error> {
-        let options = &self.client.options;
-        let mut attempts = Attempts::new(options.attempts_max, Instant::now() + options.deadline);
+        let Client { options, retries, .. } = &self.client;
+        let deadline = Instant::now() + options.deadline;
+        let mut attempts = Attempts::new(options.attempts_max, deadline, retries);
         loop {
             match attempts.bounded(self.attempt(&measurement)).await {
                 Ok(response) => {

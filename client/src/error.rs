@@ -103,6 +103,8 @@ fn code_of(status: &Status) -> Code {
     match (status.code(), status.source()) {
         (Code::Unknown | Code::Internal, Some(_)) => Code::Unavailable,
         (Code::Cancelled, Some(source)) if caused_by_timeout(source) => Code::DeadlineExceeded,
+        // Who cancels a call does not wait for its answer: the node let go of it, and ends.
+        (Code::Cancelled, Some(_)) => Code::Unavailable,
         (code, _) => code,
     }
 }

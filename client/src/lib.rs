@@ -17,14 +17,18 @@
 mod artifacts;
 mod client;
 mod closed_loop;
+mod credentials;
 mod error;
 mod operations;
 mod retry;
+mod verbatim;
 
 pub use client::{Client, Options};
 pub use closed_loop::ClosedLoop;
+pub use credentials::Credentials;
 pub use error::{Error, FieldViolation};
 pub use operations::progress;
 pub use tonic::Code;
 /// The messages this client sends and receives.
 pub use vbar_proto::{google::longrunning, v1};
+pub use verbatim::VerbatimLoop;

@@ -13,7 +13,7 @@ use vbar_proto::{
     v1::{PrecomputeMetadata, PrecomputeRequest, PrecomputeResponse, Problem},
 };
 
-use crate::{Client, Error, retry::Attempts};
+use crate::{Client, Error, retry::time_left};
 
 /// A node is asked to hold one wait for at most this long; then it is asked again.
 const WAIT_MAX: Duration = Duration::from_secs(10);
@@ -138,18 +138,24 @@ impl Client {
             if operation.done {
                 return Ok(operation);
             }
-            let left = Attempts::new(1, deadline).time_left()?;
-            if can_wait {
-                match self.wait_once(&operation.name, left, every).await {
-                    Ok(latest) => operation = latest,
-                    // AIP-151 makes waiting optional for a node; looking is not.
-                    Err(error) if error.code == Code::Unimplemented => can_wait = false,
-                    Err(error) => return Err(error),
-                }
+            let left = time_left(deadline)?;
+            let latest = if can_wait {
+                self.wait_once(&operation.name, left, every).await
             } else {
                 tokio::time::sleep(pause.min(left)).await;
                 pause = (pause * 2).min(LOOK_PAUSE.1);
-                operation = self.look(&operation.name, left).await?;
+                self.look(&operation.name, left).await
+            };
+            match latest {
+                Ok(latest) => operation = latest,
+                // AIP-151 makes waiting optional for a node; looking is not.
+                Err(error) if can_wait && error.code == Code::Unimplemented => can_wait = false,
+                // The node has no room for a look just now, which says nothing of the operation.
+                Err(Error { code: Code::ResourceExhausted, retry_after: Some(asked), .. }) => {
+                    self.retries.add_one();
+                    tokio::time::sleep(asked.min(left)).await;
+                }
+                Err(error) => return Err(error),
             }
         }
     }

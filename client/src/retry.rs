@@ -1,6 +1,12 @@
 //! When to try again, and when to give up.
 
-use std::time::Duration;
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
 
 use tokio::time::Instant;
 use tonic::Code;
@@ -12,23 +18,38 @@ const PAUSE_FIRST: Duration = Duration::from_millis(50);
 /// No pause of our own is longer. A node may ask for more.
 const PAUSE_MAX: Duration = Duration::from_secs(2);
 
+/// How often the clones of a client tried again, all together.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Retries(Arc<AtomicU64>);
+
+impl Retries {
+    pub(crate) fn count(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn add_one(&self) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
 /// The attempts of one call.
 #[derive(Debug)]
 pub(crate) struct Attempts {
     made: u32,
     max: u32,
     deadline: Instant,
+    retries: Retries,
 }
 
 impl Attempts {
-    pub(crate) fn new(max: u32, deadline: Instant) -> Self {
-        Self { made: 0, max, deadline }
+    /// Until `deadline` and at most `max`; every repetition is added to `retries`.
+    pub(crate) fn new(max: u32, deadline: Instant, retries: &Retries) -> Self {
+        Self { made: 0, max, deadline, retries: retries.clone() }
     }
 
     /// Time left for the attempt that is about to start.
     pub(crate) fn time_left(&self) -> Result<Duration, Error> {
-        let left = self.deadline.saturating_duration_since(Instant::now());
-        if left.is_zero() { Err(deadline_exceeded()) } else { Ok(left) }
+        time_left(self.deadline)
     }
 
     /// Runs one attempt, cut at the deadline.
@@ -56,11 +77,18 @@ impl Attempts {
         }
         tracing::debug!(attempt = self.made, ?pause, %error, "trying again");
         tokio::time::sleep_until(resume).await;
+        self.retries.add_one();
         Ok(())
     }
 }
 
-pub(crate) fn deadline_exceeded() -> Error {
+/// Time left until `deadline`, or the error of a call that has none.
+pub(crate) fn time_left(deadline: Instant) -> Result<Duration, Error> {
+    let left = deadline.saturating_duration_since(Instant::now());
+    if left.is_zero() { Err(deadline_exceeded()) } else { Ok(left) }
+}
+
+fn deadline_exceeded() -> Error {
     Error::local(Code::DeadlineExceeded, "no answer before the call's deadline")
 }
 

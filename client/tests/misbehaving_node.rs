@@ -61,6 +61,8 @@ struct Scripted {
     streamed: Arc<Mutex<Vec<StepStreamRequest>>>,
     /// Looks at an operation that are answered "not done".
     looks_left: Arc<Mutex<u32>>,
+    /// Waits that are refused for want of room.
+    busy: Arc<Mutex<u32>>,
     cannot_wait: bool,
 }
 
@@ -324,6 +326,12 @@ impl Operations for Scripted {
             return Err(Status::unimplemented("this node cannot wait"));
         }
         assert!(request.into_inner().timeout.is_some(), "a wait without a bound");
+        let mut busy = self.busy.lock().unwrap();
+        if *busy > 0 {
+            *busy -= 1;
+            let details = ErrorDetails::with_retry_info(Some(Duration::from_millis(1)));
+            return Err(Status::with_error_details(Code::ResourceExhausted, "busy", details));
+        }
         Ok(Response::new(self.operation()))
     }
 }
@@ -403,6 +411,18 @@ async fn step_unavailable_for_ever_ends_after_the_allowed_attempts() {
     let error = client.step(StepRequest::default()).await.unwrap_err();
     assert_eq!((error.code, error.message.as_str()), (Code::Unavailable, "draining"));
     assert_eq!(node.calls(), 3);
+}
+
+#[tokio::test]
+async fn retries_are_counted_over_all_clones() {
+    let refused = Behaviour::Refuse(Status::invalid_argument("no"));
+    let node = Scripted::new([unavailable(), unavailable(), Behaviour::Answer, refused]);
+    let client = connected(&node).await;
+    let clone = client.with_deadline(Duration::from_secs(20));
+    clone.step(StepRequest::default()).await.unwrap();
+    assert_eq!((client.retries(), clone.retries()), (2, 2));
+    client.step(StepRequest::default()).await.unwrap_err();
+    assert_eq!(client.retries(), 2, "what is refused is not tried again");
 }
 
 #[tokio::test]
@@ -588,6 +608,19 @@ async fn precompute_waits_until_done() {
         assert_eq!(artifact.artifact_id, "a1");
         assert_eq!(*node.looks_left.lock().unwrap(), 0);
     }
+}
+
+#[tokio::test]
+async fn precompute_goes_on_waiting_for_a_node_that_is_busy() {
+    let node = Scripted {
+        looks_left: Arc::new(Mutex::new(2)),
+        busy: Arc::new(Mutex::new(3)),
+        ..Scripted::default()
+    };
+    let client = connected(&node).await;
+    let made = client.precompute(Problem::default()).await.unwrap();
+    assert!(matches!(made.outcome, Some(Outcome::Artifact(_))));
+    assert_eq!(client.retries(), 3);
 }
 
 #[tokio::test]
