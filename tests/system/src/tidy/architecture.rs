@@ -14,7 +14,7 @@ const FOLDERS: [&str; 9] =
     [".ci", "cli", "client", "docker", "guidance", "proto", "server", "simulator", "tests"];
 
 /// Manifest of each crate of ours, and which others it may depend on.
-const CRATES: [(&str, &str, &[&str]); 7] = [
+const CRATES: [(&str, &str, &[&str]); 8] = [
     ("proto", "vbar-proto", &[]),
     ("guidance", "vbar-guidance", &[]),
     ("server", "vbar-server", &["vbar-proto", "vbar-guidance"]),
@@ -26,6 +26,7 @@ const CRATES: [(&str, &str, &[&str]); 7] = [
         "vbar-system-tests",
         &["vbar-server", "vbar-client", "vbar-simulator", "vbar-proto"],
     ),
+    ("tests/fuzz", "vbar-fuzz", &["vbar-server"]),
 ];
 
 /// What only tests and benchmarks of a crate may depend on besides.
@@ -33,17 +34,58 @@ const FOR_TESTS: [(&str, &[&str]); 2] =
     [("vbar-server", &["vbar-client"]), ("vbar-simulator", &["vbar-server"])];
 
 /// Modules of the server, which of each other they may use, and which crates of ours.
-const SERVER: [(&str, &[&str], &[&str]); 9] = [
+const SERVER: [(&str, &[&str], &[&str]); 13] = [
     ("telemetry", &[], &[]),
     ("store", &[], &[]),
-    ("compute", &["telemetry"], &["vbar_guidance"]),
+    ("access", &["telemetry"], &[]),
+    ("recording", &["telemetry"], &[]),
+    ("compute", &["access", "telemetry"], &["vbar_guidance"]),
     ("wire", &[], &["vbar_proto", "vbar_guidance"]),
-    ("config", &["wire"], &[]),
+    ("config", &["access", "recording", "store", "wire"], &[]),
     ("offline", &["wire"], &["vbar_proto"]),
-    ("service", &["config", "telemetry", "store", "compute", "wire"], &["vbar_guidance"]),
-    ("transport", &["config", "telemetry", "service", "wire"], &["vbar_proto"]),
-    ("node", &["config", "telemetry", "store", "compute", "wire", "service", "transport"], &[]),
+    ("service", &["access", "config", "telemetry", "store", "compute", "wire"], &["vbar_guidance"]),
+    (
+        "transport",
+        &["access", "config", "recording", "telemetry", "service", "wire"],
+        &["vbar_proto"],
+    ),
+    (
+        "node",
+        &[
+            "access",
+            "config",
+            "recording",
+            "telemetry",
+            "store",
+            "compute",
+            "wire",
+            "service",
+            "transport",
+        ],
+        &[],
+    ),
+    // Only where targets are fuzzed.
+    (
+        "fuzzing",
+        &[
+            "access",
+            "config",
+            "missions",
+            "offline",
+            "recording",
+            "service",
+            "store",
+            "transport",
+            "wire",
+        ],
+        &["vbar_proto", "vbar_guidance"],
+    ),
+    // Only in tests and where targets are fuzzed.
+    ("missions", &[], &["vbar_proto"]),
 ];
+
+/// Modules that the server's own tests share with those over sockets.
+const ONLY_IN_TESTS: [&str; 2] = ["missions", "seeds"];
 
 /// Only the named folders stand at the root.
 pub fn top_level(tree: &Tree) -> Vec<String> {
@@ -222,6 +264,7 @@ pub fn server_arrows(tree: &Tree) -> Vec<String> {
                 segments
                     .get(1)
                     .filter(|to| *to != module && is_module(to) && !inside.contains(&to.as_str()))
+                    .filter(|to| !ONLY_IN_TESTS.contains(&to.as_str()))
             } else {
                 (first.starts_with("vbar_") && !outside.contains(&first) && !test)
                     .then_some(&segments[0])

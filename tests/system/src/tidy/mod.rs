@@ -8,6 +8,7 @@ mod citations;
 mod methods;
 mod paths;
 mod purity;
+mod safety;
 mod tree;
 mod words;
 
@@ -15,6 +16,7 @@ pub use architecture::{crate_arrows, guidance_floors, server_arrows, top_level};
 pub use citations::citations;
 pub use methods::methods;
 pub use purity::{fixed_order_sums, purity};
+pub use safety::unsafe_forbidden;
 pub use tree::Tree;
 pub use words::words;
 
@@ -22,7 +24,7 @@ pub use words::words;
 pub type Rule = (&'static str, fn(&Tree) -> Vec<String>);
 
 /// Every rule.
-pub const RULES: [Rule; 9] = [
+pub const RULES: [Rule; 10] = [
     ("top-level folders", top_level),
     ("arrows between crates", crate_arrows),
     ("floors of guidance", guidance_floors),
@@ -31,5 +33,6 @@ pub const RULES: [Rule; 9] = [
     ("citations", citations),
     ("purity of guidance", purity),
     ("fixed order of sums", fixed_order_sums),
+    ("no unsafe code", unsafe_forbidden),
     ("words", words),
 ];

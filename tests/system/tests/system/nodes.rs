@@ -83,7 +83,7 @@ fn next_measurement(answer: &StepResponse) -> Option<Measurement> {
 }
 
 /// Flies from `start`, calling `before_step` with the step's number.
-async fn fly(
+pub(crate) async fn fly(
     mut flight: vbar_client::ClosedLoop,
     start: Measurement,
     steps: usize,

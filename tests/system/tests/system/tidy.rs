@@ -4,7 +4,7 @@ use std::path::Path;
 
 use vbar_system_tests::tidy::{
     RULES, Tree, citations, crate_arrows, fixed_order_sums, guidance_floors, methods, purity,
-    server_arrows, top_level, words,
+    server_arrows, top_level, unsafe_forbidden, words,
 };
 
 #[test]
@@ -202,6 +202,26 @@ fn nalgebra_with_std_is_found() {
         finds(fixed_order_sums, &manifest(text), &["nalgebra"]);
     }
     finds(fixed_order_sums, &[("Cargo.lock", "name = \"matrixmultiply\"")], &["matrixmultiply"]);
+}
+
+#[test]
+fn unsafe_code_allowed_is_found() {
+    let root = "[workspace]\nmembers=[]\n[workspace.lints.rust]\nunsafe_code = 'forbid'";
+    let inherits = "[package]\nname='x'\n[lints]\nworkspace = true";
+    let own = "[package]\nname='x'\n[workspace]\n[lints.rust]\nunsafe_code = 'forbid'";
+    accepts(
+        unsafe_forbidden,
+        &[("Cargo.toml", root), ("cli/Cargo.toml", inherits), ("tests/fuzz/Cargo.toml", own)],
+    );
+    for (path, manifest) in [
+        ("Cargo.toml", root.replace("forbid", "deny")),
+        ("Cargo.toml", "[workspace]\nmembers=[]\n[lints]\nworkspace = true".to_owned()),
+        ("cli/Cargo.toml", inherits.replace("true", "false")),
+        ("cli/Cargo.toml", "[package]\nname='x'".to_owned()),
+        ("tests/fuzz/Cargo.toml", own.replace("forbid", "warn")),
+    ] {
+        finds(unsafe_forbidden, &[(path, &*manifest)], &[path, "unsafe"]);
+    }
 }
 
 #[test]
