@@ -147,7 +147,7 @@ impl World {
             Command::Delete(name) => self.delete(name),
             Command::LetGo(shards) => self.stage.let_go(shards),
             Command::Expire(name) => drop(self.stage.made.lock().unwrap().remove(&name)),
-            Command::Sweep => self.jobs.sweep(),
+            Command::Sweep => self.sweep(),
             Command::SweepLater => self.sweep_later(),
             Command::Kill => self.kill(),
             Command::Restart => self.restart(),
@@ -277,6 +277,13 @@ impl World {
         }
     }
 
+    fn sweep(&mut self) {
+        self.jobs.sweep();
+        if !self.is_down {
+            self.expected.values_mut().for_each(|job| job.is_unwritten = false);
+        }
+    }
+
     /// Forgets what ended and every request id: by a node that does no parts, because they would all
     /// be late by its clock.
     fn sweep_later(&mut self) {
@@ -335,12 +342,8 @@ impl World {
             return self.kill();
         }
         self.look();
+        // What ended while nothing could be written down is written down now.
         self.jobs.stop(PATIENCE);
-        for job in self.expected.values_mut() {
-            if job.is_unwritten && matches!(self.who, Who::Single) {
-                job.ending = None;
-            }
-        }
         self.look_at_what_ended_on_the_way();
         self.reopen(LIMITS.threads);
     }

@@ -3,8 +3,9 @@
 //!
 //! A job has the id of what it makes, so the same problem is the same job. Every change of a job
 //! that its callers could have been told of is in the store first, but for an end that comes while
-//! the store of a single process does not answer; and whoever is killed in the midst of it, others
-//! go on. [`Single`] does the jobs of a store that one process has for itself,
+//! the store of a single process does not answer: that is written down by the next sweep that can,
+//! and found or computed again if the process is killed before. And whoever is killed in the midst
+//! of a job, others go on. [`Single`] does the jobs of a store that one process has for itself,
 //! [`Fleet`] those of a store that many reach; to callers both are [`Jobs`].
 
 #[cfg(test)]
@@ -21,6 +22,7 @@ pub(crate) mod stored;
 use std::{
     fmt::Debug,
     panic::{AssertUnwindSafe, catch_unwind},
+    thread::{self, JoinHandle},
     time::{Duration, Instant, SystemTime},
 };
 
@@ -259,6 +261,15 @@ fn stays(ending: Option<&Ending>, is_made: bool, is_repeated: bool) -> bool {
         // What it made can have expired since.
         Some(Ending::Made) => is_made,
         Some(Ending::Failed(_) | Ending::Cancelled) => is_repeated,
+    }
+}
+
+/// Gives threads that were told to end the time to do so.
+fn wait_for_end(threads: &[JoinHandle<()>], grace: Duration) {
+    const LOOK_EVERY: Duration = Duration::from_millis(5);
+    let until = Instant::now() + grace;
+    while threads.iter().any(|thread| !thread.is_finished()) && Instant::now() < until {
+        thread::sleep(LOOK_EVERY);
     }
 }
 

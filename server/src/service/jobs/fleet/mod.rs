@@ -28,7 +28,7 @@ use tokio::sync::watch;
 
 use super::{
     Ending, JobLimits, Jobs, Order, View, Work, gauge, queue_full, record::JobRecord,
-    requests::Requests, running, shutting_down, stays, unknown,
+    requests::Requests, running, shutting_down, stays, unknown, wait_for_end,
 };
 use crate::{
     service::{Error, clock::Clock},
@@ -234,13 +234,9 @@ impl<W: Work> Jobs<W> for Fleet<W> {
     }
 
     fn stop(&self, grace: Duration) {
-        const LOOK_EVERY: Duration = Duration::from_millis(5);
         self.closing.send_replace(true);
         self.inner.close();
-        let until = Instant::now() + grace;
-        while self.threads.iter().any(|thread| !thread.is_finished()) && Instant::now() < until {
-            thread::sleep(LOOK_EVERY);
-        }
+        wait_for_end(&self.threads, grace);
     }
 
     fn closing(&self) -> watch::Receiver<bool> {

@@ -35,6 +35,8 @@ pub(super) struct Job<W: Work> {
     record: JobRecord,
     /// Of its entry in the store.
     revision: Revision,
+    /// It ended, and the store does not know: it did not answer then.
+    is_unwritten: bool,
     /// Until it is done.
     run: Option<Run<W>>,
     changes: watch::Sender<()>,
@@ -122,12 +124,18 @@ impl<W: Work> Job<W> {
                 told: Arc::new(Told::new(shards)),
             }
         });
-        Self { id, record, revision, run, changes: watch::Sender::new(()) }
+        Self { id, record, revision, is_unwritten: false, run, changes: watch::Sender::new(()) }
     }
 
-    /// A job that is done.
+    /// A job that is done, as the store has it.
     pub(super) fn finished(id: ArtifactId, record: JobRecord, revision: Revision) -> Self {
-        Self { id, record, revision, run: None, changes: watch::Sender::new(()) }
+        let changes = watch::Sender::new(());
+        Self { id, record, revision, is_unwritten: false, run: None, changes }
+    }
+
+    /// The same job, whose end the store does not know.
+    pub(super) fn unwritten(self) -> Self {
+        Self { is_unwritten: true, ..self }
     }
 
     pub(super) fn revision(&self) -> Revision {
@@ -252,17 +260,26 @@ impl<W: Work> Board<W> {
         same.then(|| (job.record.clone(), job.revision))
     }
 
-    /// Notes what the store knows now of a job that goes on.
-    pub(super) fn set_revision(&mut self, id: &ArtifactId, revision: Revision) {
+    /// Records of jobs that are done without the store's knowledge, with its revision of each.
+    pub(super) fn unwritten(&self) -> Vec<(ArtifactId, JobRecord, Revision)> {
+        let unwritten = self.jobs.values().filter(|job| job.is_unwritten);
+        unwritten.map(|job| (job.id, job.record.clone(), job.revision)).collect()
+    }
+
+    /// Notes that the store knows all of a job.
+    pub(super) fn written(&mut self, id: &ArtifactId, revision: Revision) {
         if let Some(job) = self.jobs.get_mut(id) {
-            job.revision = revision;
+            (job.revision, job.is_unwritten) = (revision, false);
         }
     }
 
-    /// A job is done: its threads are told to stop, whoever waits is told to look.
-    pub(super) fn settle(&mut self, id: &ArtifactId, record: JobRecord, revision: Revision) {
+    /// A job is done: its threads are told to stop, whoever waits is told to look. Without a
+    /// revision the store does not know of it.
+    pub(super) fn settle(&mut self, id: &ArtifactId, record: JobRecord, known: Option<Revision>) {
         let Some(job) = self.jobs.get_mut(id) else { return };
-        (job.record, job.revision) = (record, revision);
+        job.record = record;
+        job.is_unwritten = known.is_none();
+        job.revision = known.unwrap_or(job.revision);
         if let Some(run) = job.run.take() {
             run.key.store(true, Ordering::Relaxed);
             self.unfinished -= 1;

@@ -9,15 +9,15 @@ mod threads;
 use std::{
     io,
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
-    thread::{self, JoinHandle},
-    time::{Duration, Instant, SystemTime},
+    thread::JoinHandle,
+    time::{Duration, SystemTime},
 };
 
 use tokio::sync::watch;
 
 use super::{
     Ending, JobLimits, Jobs, Order, View, Work, gauge, given_up, queue_full, record::JobRecord,
-    requests::Requests, running, shutting_down, stays, unknown,
+    requests::Requests, running, shutting_down, stays, unknown, wait_for_end,
 };
 use crate::{
     service::{Error, clock::Clock},
@@ -162,6 +162,7 @@ impl<W: Work> Jobs<W> for Single<W> {
 
     fn sweep(&self) {
         let inner = &*self.inner;
+        inner.write_down_ends();
         let kept_for = inner.limits.kept_for;
         let oldest = inner.clock.behind().checked_sub(kept_for).unwrap_or(SystemTime::UNIX_EPOCH);
         let old = inner.board().ended_before(oldest);
@@ -176,13 +177,9 @@ impl<W: Work> Jobs<W> for Single<W> {
     }
 
     fn stop(&self, grace: Duration) {
-        const LOOK_EVERY: Duration = Duration::from_millis(5);
         self.closing.send_replace(true);
         self.inner.stop();
-        let until = Instant::now() + grace;
-        while self.threads.iter().any(|thread| !thread.is_finished()) && Instant::now() < until {
-            thread::sleep(LOOK_EVERY);
-        }
+        wait_for_end(&self.threads, grace);
     }
 
     fn closing(&self) -> watch::Receiver<bool> {
@@ -265,11 +262,14 @@ impl<W: Work> Inner<W> {
             record.end(record.shards_done(), ending, self.clock.ahead());
             let written = self.store.write(Ledger::Jobs, &id.0, record.encode().into(), revision);
             // A full disk must not keep a node from starting; the next start finds the same.
-            let revision = written.unwrap_or_else(|fault| {
-                tracing::error!(%id, %fault, "the end of a job could not be written down");
-                revision
-            });
-            self.board().place(id, Job::finished(id, record, revision));
+            let job = match written {
+                Ok(revision) => Job::finished(id, record, revision),
+                Err(fault) => {
+                    tracing::error!(%id, %fault, "the end of a job could not be written down");
+                    Job::finished(id, record, revision).unwritten()
+                }
+            };
+            self.board().place(id, job);
         }
         self.metrics.jobs_unfinished.set(gauge(self.board().unfinished()));
         Ok(())
@@ -290,24 +290,37 @@ impl<W: Work> Inner<W> {
         let outcome = ending.outcome();
         record.end(record.shards_done(), ending, self.clock.ahead());
         let written = self.store.write(Ledger::Jobs, &id.0, record.encode().into(), revision);
-        let revision = match (written, run) {
-            (Ok(revision), _) => revision,
+        let known = match (written, run) {
+            (Ok(revision), _) => Some(revision),
             (Err(fault), None) => return Err(fault),
-            // What was computed stays computed; after a restart it is found, or computed again.
+            // What was computed stays computed; it is written down when the store answers again.
             (Err(fault), Some(_)) => {
                 tracing::error!(%id, %fault, "the end of a job could not be written down");
-                revision
+                None
             }
         };
         let mut board = self.board();
-        board.settle(&id, record, revision);
+        board.settle(&id, record, known);
         self.metrics.jobs_unfinished.set(gauge(board.unfinished()));
         drop(board);
         self.count(outcome);
         Ok(())
     }
 
+    /// Writes down the ends that the store did not take when they came.
+    fn write_down_ends(&self) {
+        let _journal = self.journal();
+        let unwritten = self.board().unwritten();
+        for (id, record, revision) in unwritten {
+            match self.store.write(Ledger::Jobs, &id.0, record.encode().into(), revision) {
+                Ok(revision) => self.board().written(&id, revision),
+                Err(fault) => tracing::error!(%id, %fault, "a job's end is still not written down"),
+            }
+        }
+    }
+
     fn stop(&self) {
+        self.write_down_ends();
         let _journal = self.journal();
         let running = {
             let mut board = self.board();
@@ -317,7 +330,7 @@ impl<W: Work> Inner<W> {
         self.ready.notify_all();
         for (id, record, revision) in running {
             match self.store.write(Ledger::Jobs, &id.0, record.encode().into(), revision) {
-                Ok(revision) => self.board().set_revision(&id, revision),
+                Ok(revision) => self.board().written(&id, revision),
                 Err(fault) => tracing::error!(%id, %fault, "a job could not be handed back"),
             }
         }

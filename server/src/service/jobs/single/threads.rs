@@ -66,7 +66,7 @@ impl<W: Work> Inner<W> {
             return;
         };
         match self.store.write(Ledger::Jobs, &id.0, record.encode().into(), revision) {
-            Ok(revision) => self.board().set_revision(&id, revision),
+            Ok(revision) => self.board().written(&id, revision),
             Err(fault) => tracing::error!(%id, %fault, "the start of a job was not written down"),
         }
     }
