@@ -107,7 +107,7 @@ impl Default for Config {
             allow_insecure_listen: false,
             compute_threads: thread::available_parallelism().map_or(1, usize::from),
             compute_wait: Duration::from_millis(20),
-            compute_overload_wait: Duration::from_millis(5),
+            compute_overload_wait: Duration::from_millis(2),
             compute_patient_wait: Duration::from_secs(1),
             compute_waiting_max: 256,
             computation_time_max: Duration::from_secs(60),

@@ -1,4 +1,4 @@
-//! The load: quiet, at capacity, and at twice that with every other kind of traffic.
+//! The load: quiet, at capacity beside every other kind of traffic, and at twice that.
 
 use std::{
     net::SocketAddr,
@@ -8,7 +8,7 @@ use std::{
 
 use fastrand::Rng;
 use prost::Message;
-use tokio::{sync::Semaphore, task::JoinSet, time::sleep};
+use tokio::{runtime::Handle, sync::Semaphore, task::JoinSet, time::sleep};
 use vbar_client::{
     Client, Code, Error,
     v1::{Problem, StepRequest, precompute_response::Outcome, problem, step_stream_request},
@@ -23,6 +23,8 @@ use super::{
 
 /// Connections that steps come over.
 const CONNECTIONS: usize = 8;
+/// Clients that do everything else, each one of everything at a time.
+const OTHERS: usize = 2;
 /// Steps on their way at once, at most: far more than the node lets wait.
 const UNDER_WAY: usize = 600;
 
@@ -30,6 +32,10 @@ const UNDER_WAY: usize = 600;
 pub(super) struct Load<'a> {
     node: &'a Process,
     clients: Vec<Client>,
+    /// Everything but the timed steps, with clients of its own: these must not wait until the load
+    /// has read somebody else's plan.
+    others: Handle,
+    other_clients: Vec<Client>,
     questions: Arc<Questions>,
     rng: Rng,
 }
@@ -100,12 +106,27 @@ impl Phase {
 }
 
 impl<'a> Load<'a> {
-    pub(super) async fn new(node: &'a Process, questions: Questions, seed: u64) -> Self {
-        let mut clients = Vec::with_capacity(CONNECTIONS);
-        for _ in 0..CONNECTIONS {
-            clients.push(client(&node.url).await);
-        }
-        Self { node, clients, questions: Arc::new(questions), rng: Rng::with_seed(seed) }
+    /// `others` runs everything but the timed steps.
+    pub(super) async fn new(
+        node: &'a Process,
+        questions: Questions,
+        seed: u64,
+        others: Handle,
+    ) -> Self {
+        let connect = |count| {
+            let url = node.url.clone();
+            async move {
+                let mut clients = Vec::with_capacity(count);
+                for _ in 0..count {
+                    clients.push(client(&url).await);
+                }
+                clients
+            }
+        };
+        let clients = connect(CONNECTIONS).await;
+        let other_clients = others.spawn(connect(OTHERS)).await.expect("the node listens");
+        let questions = Arc::new(questions);
+        Self { node, clients, others, other_clients, questions, rng: Rng::with_seed(seed) }
     }
 
     fn phase(&self, lasts: Duration) -> Phase {
@@ -126,8 +147,8 @@ impl<'a> Load<'a> {
         ended(phase)
     }
 
-    /// Most steps a second: with few callers the node waits for them, with many it refuses some, who
-    /// then stay away for longer than they had to.
+    /// Most steps a second beside everything else: with few callers the node waits for them, with
+    /// many it refuses some, who then stay away for longer than they had to.
     pub(super) async fn capacity(&mut self, lasts: Duration) -> f64 {
         let mut most = 0.0_f64;
         for callers in [1, 2, 4].map(|each| each * CONNECTIONS) {
@@ -140,7 +161,7 @@ impl<'a> Load<'a> {
     async fn answered_by(&mut self, callers: usize, lasts: Duration) -> f64 {
         let phase = self.phase(lasts.max(Duration::from_millis(300)));
         let begun = Instant::now();
-        let mut tasks = JoinSet::new();
+        let (others, mut tasks) = (self.everything_else(&phase), JoinSet::new());
         for client in self.clients.iter().cycle().take(callers) {
             let (phase, client, mut rng) = (phase.clone(), client.clone(), self.rng.fork());
             tasks.spawn(async move {
@@ -152,35 +173,40 @@ impl<'a> Load<'a> {
         }
         tasks.join_all().await;
         let seconds = begun.elapsed().as_secs_f64();
+        others.join_all().await;
         ended(phase).admitted as f64 / seconds
     }
 
     /// `rate` steps a second, however fast they are answered, and everything else beside them.
     pub(super) async fn overload(&mut self, rate: f64, lasts: Duration) -> Seen {
         let phase = self.phase(lasts);
-        let mut tasks = JoinSet::new();
-        for i in 0..2 {
-            let (phase, client, rng) =
-                (phase.clone(), self.clients[i].clone(), [(); 8].map(|()| self.rng.fork()));
-            let [a, b, c, d, e, f, g, h] = rng;
-            tasks.spawn(fly(phase.clone(), client.clone(), a));
-            tasks.spawn(plan(phase.clone(), client.clone(), b));
-            tasks.spawn(report(phase.clone(), client.clone(), c));
-            tasks.spawn(fault(phase.clone(), client.clone(), d));
-            tasks.spawn(give_up(phase.clone(), client.clone(), e));
-            tasks.spawn(precompute(phase.clone(), client, f));
-            tasks.spawn(be_a_nuisance(phase.clone(), self.node.address(), g));
-            tasks.spawn(be_a_nuisance(phase, self.node.address(), h));
-        }
+        let tasks = self.everything_else(&phase);
         let steps = steps(phase.clone(), self.clients.clone(), rate, self.rng.fork());
         tokio::join!(steps, watch_memory(&phase, self.node, lasts), tasks.join_all());
         ended(phase)
+    }
+
+    /// All other traffic, for as long as the phase goes on.
+    fn everything_else(&mut self, phase: &Phase) -> JoinSet<()> {
+        let (mut tasks, others) = (JoinSet::new(), &self.others);
+        for client in &self.other_clients {
+            let [a, b, c, d, e, f, g, h] = [(); 8].map(|()| self.rng.fork());
+            tasks.spawn_on(fly(phase.clone(), client.clone(), a), others);
+            tasks.spawn_on(plan(phase.clone(), client.clone(), b), others);
+            tasks.spawn_on(report(phase.clone(), client.clone(), c), others);
+            tasks.spawn_on(fault(phase.clone(), client.clone(), d), others);
+            tasks.spawn_on(give_up(phase.clone(), client.clone(), e), others);
+            tasks.spawn_on(precompute(phase.clone(), client.clone(), f), others);
+            tasks.spawn_on(be_a_nuisance(phase.clone(), self.node.address(), g), others);
+            tasks.spawn_on(be_a_nuisance(phase.clone(), self.node.address(), h), others);
+        }
+        tasks
     }
 }
 
 /// What a phase saw, when all its tasks are over.
 fn ended(phase: Phase) -> Seen {
-    std::mem::replace(&mut *phase.seen(), Seen::nothing())
+    std::mem::replace(&mut *phase.seen(), Seen::nothing()).end()
 }
 
 fn choice<'q, T>(rng: &mut Rng, of: &'q [T]) -> &'q T {

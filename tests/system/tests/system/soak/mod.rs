@@ -19,7 +19,7 @@ use std::{
     time::Duration,
 };
 
-use tokio::runtime::Runtime;
+use tokio::runtime::{self, Runtime};
 
 use load::Load;
 use processors::Share;
@@ -92,19 +92,31 @@ fn soak_answers_are_right_and_refusals_say_when_to_return() {
     println!("{}", processors::keep_to(Share::Node));
     let [quiet, loaded] = folders.each_ref().map(|folder| Process::start(folder.path()));
     println!("{}", processors::keep_to(Share::Load));
+    let others = runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .on_thread_start(processors::yield_to_others)
+        .enable_all()
+        .build()
+        .unwrap();
     let runtime = Runtime::new().unwrap();
-    runtime.block_on(soak(quiet, loaded, lasts, seed));
+    runtime.block_on(soak(quiet, loaded, lasts, seed, others.handle().clone()));
 }
 
 #[allow(clippy::print_stdout, reason = "the figures are what it is for")]
-async fn soak(quiet: Process, mut loaded: Process, lasts: Duration, seed: u64) {
+async fn soak(
+    quiet: Process,
+    mut loaded: Process,
+    lasts: Duration,
+    seed: u64,
+    others: runtime::Handle,
+) {
     let (questions, same) =
         tokio::join!(Questions::answered_by(&quiet.url), Questions::answered_by(&loaded.url));
     // Two processes, the same bytes: what is compared with below is no accident.
     questions.must_equal(&same);
     drop((quiet, same));
 
-    let mut load = Load::new(&loaded, questions, seed).await;
+    let mut load = Load::new(&loaded, questions, seed, others).await;
     let unloaded = load.one_after_another(lasts / 8).await;
     let capacity = load.capacity(lasts / 8).await;
     let overload = load.overload(2.0 * capacity, lasts).await;

@@ -1,9 +1,44 @@
 //! The figures of a soak, as a table and as JSON.
 
-use std::{collections::BTreeMap, fmt::Write as _, time::Duration};
+use std::{
+    collections::BTreeMap,
+    fmt::Write as _,
+    time::{Duration, Instant},
+};
 
 use hdrhistogram::Histogram;
 use serde_json::{Value, json};
+
+use super::processors::Ticks;
+
+/// Length of the stretches of a phase that are told apart by what other machines took in them.
+const STRETCH: Duration = Duration::from_secs(2);
+/// A stretch is calm if they took less than this share of the processors.
+const CALM: f64 = 0.005;
+
+/// A short time of a phase.
+#[derive(Debug)]
+struct Stretch {
+    begun: Instant,
+    before: Option<Ticks>,
+    steps: Histogram<u64>,
+    /// Share of the processors that other machines took, once it is over.
+    stolen: Option<f64>,
+}
+
+impl Stretch {
+    fn begin() -> Self {
+        Self { begun: Instant::now(), before: Ticks::now(), steps: histogram(), stolen: None }
+    }
+
+    fn end(&mut self) {
+        self.stolen = Ticks::now().zip(self.before).map(|(now, before)| now.stolen_since(before));
+    }
+
+    fn is_calm(&self) -> bool {
+        self.stolen.is_some_and(|stolen| stolen < CALM)
+    }
+}
 
 /// What one phase saw.
 #[derive(Debug)]
@@ -26,6 +61,8 @@ pub(super) struct Seen {
     pub(super) memory_mib: Vec<f64>,
     /// Steps that were due, whatever became of them.
     pub(super) offered: u64,
+    /// All of it in short stretches; the last one goes on.
+    stretches: Vec<Stretch>,
 }
 
 impl Seen {
@@ -40,7 +77,14 @@ impl Seen {
             wrong: Vec::new(),
             memory_mib: Vec::new(),
             offered: 0,
+            stretches: vec![Stretch::begin()],
         }
+    }
+
+    /// The phase is over.
+    pub(super) fn end(mut self) -> Self {
+        self.stretches.last_mut().into_iter().for_each(Stretch::end);
+        self
     }
 
     /// A step was answered.
@@ -49,6 +93,13 @@ impl Seen {
         let micros = u64::try_from(took.as_micros()).unwrap_or(u64::MAX);
         let histogram = self.steps.entry(method).or_insert_with(histogram);
         histogram.saturating_record(micros);
+        if let Some(stretch) = self.stretches.last_mut() {
+            stretch.steps.saturating_record(micros);
+            if stretch.begun.elapsed() >= STRETCH {
+                stretch.end();
+                self.stretches.push(Stretch::begin());
+            }
+        }
     }
 
     /// Something else was answered as it should.
@@ -61,6 +112,20 @@ impl Seen {
         if self.wrong.len() < 100 {
             self.wrong.push(what);
         }
+    }
+
+    /// Steps of the calm stretches, and how many of these there were.
+    fn calm(&self) -> (Histogram<u64>, usize) {
+        let mut all = histogram();
+        let calm = self.stretches.iter().filter(|stretch| stretch.is_calm());
+        let count = calm.clone().count();
+        calm.for_each(|stretch| all.add(&stretch.steps).expect("the same bounds"));
+        (all, count)
+    }
+
+    /// Share of the processors that other machines took in the worst stretch.
+    fn stolen_most(&self) -> f64 {
+        self.stretches.iter().filter_map(|stretch| stretch.stolen).fold(0.0, f64::max)
     }
 
     /// All steps together.
@@ -107,6 +172,13 @@ impl Report {
         ms(&self.overload.all(), 0.99) / ms(&self.unloaded.all(), 0.99)
     }
 
+    /// The same in calm stretches, if there were any.
+    fn p99_ratio_calm(&self) -> Option<f64> {
+        let ((quiet, _), (loaded, _)) = (self.unloaded.calm(), self.overload.calm());
+        let known = !quiet.is_empty() && !loaded.is_empty();
+        known.then(|| ms(&loaded, 0.99) / ms(&quiet, 0.99))
+    }
+
     /// For people.
     pub(super) fn table(&self) -> String {
         let mut text = String::new();
@@ -136,6 +208,18 @@ impl Report {
         }
         row("all", &self.unloaded.all(), &self.overload.all());
         let seen = &self.overload;
+        let ((calm_quiet, _), (calm_loaded, calm)) = (self.unloaded.calm(), seen.calm());
+        row("all, in calm stretches", &calm_quiet, &calm_loaded);
+        writeln!(
+            text,
+            "calm: {calm} of {} stretches of {} s, in which other machines took less than {:.1} % \
+             of the processors; {:.0} % in the worst",
+            seen.stretches.len(),
+            STRETCH.as_secs(),
+            100.0 * CALM,
+            100.0 * seen.stolen_most(),
+        )
+        .expect("a String takes everything");
         let memory: Vec<_> = seen.memory_mib.iter().map(|mib| format!("{mib:.0}")).collect();
         write!(
             text,
@@ -160,7 +244,7 @@ impl Report {
     /// For machines.
     pub(super) fn json(&self) -> Value {
         let steps = |seen: &Seen| -> Value {
-            let all = [("all", seen.all())];
+            let all = [("all", seen.all()), ("calm", seen.calm().0)];
             let each = seen.steps.iter().map(|(method, histogram)| (*method, histogram.clone()));
             let rows = each.chain(all).map(|(name, histogram)| {
                 let figures = json!({
@@ -181,6 +265,10 @@ impl Report {
             "unloaded": steps(&self.unloaded),
             "loaded": steps(&self.overload),
             "p99_ratio": self.p99_ratio(),
+            "p99_ratio_calm": self.p99_ratio_calm(),
+            "stretches": self.overload.stretches.len(),
+            "stretches_calm": self.overload.calm().1,
+            "stolen_most": self.overload.stolen_most(),
             "refused": self.overload.refused,
             "refused_without_a_time": self.overload.refused_without_a_time,
             "failed": self.overload.failed,
