@@ -96,6 +96,34 @@ fn offline_sampling_without_an_answer_names_rows_or_flies_the_tail() {
     assert!(!certificate.passed && certificate.claim == Claim::PreviousPlanTail);
 }
 
+/// Where answers end, rounding decides whether there is one: a flight goes on all the same.
+#[test]
+fn offline_sampling_always_has_a_command_after_the_first_step() {
+    let artifact = prepare(&problem()).unwrap();
+    let inside = DVector::from_vec(vec![2.0, 0.0]);
+    let good = step(&artifact, &OfflineSampling::start(&artifact), &inside);
+    let mut chance = ChaCha8Rng::seed_from_u64(11);
+    let (mut optima, mut tails) = (0, 0);
+    for _ in 0..40 {
+        let direction = DVector::from_fn(2, |_, _| chance.random_range(-1.0..1.0));
+        let (mut near, mut far) = (0.0, 50.0);
+        // Down to two neighbouring numbers.
+        for _ in 0..60 {
+            let middle = 0.5 * (near + far);
+            let step = step(&artifact, &good.next, &(&inside + &direction * middle));
+            assert!(matches!(step.verdict, Verdict::Command(_)), "{middle} along {direction}");
+            if step.diagnostics.branch == Branch::Optimum {
+                assert!(step.certificate.unwrap().passed);
+                (near, optima) = (middle, optima + 1);
+            } else {
+                (far, tails) = (middle, tails + 1);
+            }
+        }
+        assert!(near > 0.0 && far - near < 1e-12, "{near} to {far} along {direction}");
+    }
+    assert!(optima > 400 && tails > 400, "{optima} optima, {tails} tails");
+}
+
 #[test]
 fn offline_sampling_names_the_least_relaxation() {
     let artifact = prepare(&problem()).unwrap();

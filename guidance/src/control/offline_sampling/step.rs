@@ -98,7 +98,7 @@ pub struct Diagnostics {
 /// Whose answer it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Branch {
-    /// The online program's.
+    /// The online program's; the certificate says whether it is proved to be the best.
     Optimum,
     /// The previous plan's, one step on, with v = 0 at its end. No guarantee.
     PreviousPlanTail,
@@ -122,12 +122,10 @@ pub(super) fn step(
     };
     let (solution, general) = match solve(&program, &state.active, budget) {
         Ok(solved) => solved,
-        Err(StepError::Failure(Failure::Interrupted(Interruption::Deadline)))
-            if present.tail.is_some() =>
-        {
-            return present.out_of_time(&program);
+        Err(Failure::Interrupted(Interruption::Cancelled)) => {
+            return Err(Interruption::Cancelled.into());
         }
-        Err(error) => return Err(error),
+        Err(failure) => return present.undecided(&program, failure),
     };
     let diagnostics = Diagnostics {
         branch: Branch::None,
@@ -141,10 +139,16 @@ pub(super) fn step(
     if solution.status == Status::PrimalInfeasible {
         return present.fall_back(&program, &solution, diagnostics, budget);
     }
-    let certificate = certify(artifact, &program, &solution, present.x, Claim::Global);
-    if !certificate.passed {
-        return Err(Failure::Numerical("the optimum did not pass its certificate".into()).into());
-    }
+    // Where answers end multipliers grow without bound, and rounding takes the proof of optimality
+    // with it: what satisfies every row is a command still, and claims no more.
+    let passed = |claim| {
+        let certificate = certify(artifact, &program, &solution, present.x, claim);
+        certificate.passed.then_some(certificate)
+    };
+    let Some(certificate) = passed(Claim::Global).or_else(|| passed(Claim::Feasible)) else {
+        let failure = Failure::Numerical("the optimum did not pass its certificate".into());
+        return present.undecided(&program, failure);
+    };
     let command = present.command(&solution.point, false);
     Ok(Step {
         index: present.step,
@@ -242,7 +246,13 @@ impl<'a> Present<'a> {
         diagnostics: Diagnostics,
         budget: Budget<'_>,
     ) -> Result<Step, StepError> {
-        let conflict = conflict(self.artifact, program, &solution.active, budget)?;
+        let conflict = conflict(self.artifact, program, &solution.active, budget);
+        if let (Err(StepError::Failure(failure @ Failure::Numerical(_))), Some(_)) =
+            (&conflict, &self.tail)
+        {
+            return self.undecided(program, failure.clone());
+        }
+        let conflict = conflict?;
         let diagnostics = Diagnostics { conflict: Some(conflict.clone()), ..diagnostics };
         match &self.tail {
             Some(tail) => self.fly_tail(tail, program, diagnostics),
@@ -256,22 +266,25 @@ impl<'a> Present<'a> {
         }
     }
 
-    /// The time was over before the program was solved: the previous plan's tail is still an
-    /// answer, and says that it is no more than that.
-    fn out_of_time(&self, program: &QuadraticProgram<'_>) -> Result<Step, StepError> {
+    /// The time was over before the program was solved, or no solver could tell whether it has an
+    /// answer, as can be where the last one ends: the previous plan's tail is still an answer, and
+    /// says that it is no more than that.
+    fn undecided(
+        &self,
+        program: &QuadraticProgram<'_>,
+        failure: Failure,
+    ) -> Result<Step, StepError> {
+        let Some(tail) = &self.tail else { return Err(failure.into()) };
         let diagnostics = Diagnostics {
             branch: Branch::None,
             expected_cost: None,
             iterations: 0,
             scans: 0,
-            general_solver: false,
+            general_solver: matches!(failure, Failure::Numerical(_)),
             missed_steps: self.missed,
             conflict: None,
         };
-        match &self.tail {
-            Some(tail) => self.fly_tail(tail, program, diagnostics),
-            None => Err(Failure::Interrupted(Interruption::Deadline).into()),
-        }
+        self.fly_tail(tail, program, diagnostics)
     }
 
     /// Flies the previous plan's tail, clipped into the input set, and says so.
@@ -356,7 +369,7 @@ fn solve(
     program: &QuadraticProgram<'_>,
     start: &[usize],
     budget: Budget<'_>,
-) -> Result<(QuadraticSolution, bool), StepError> {
+) -> Result<(QuadraticSolution, bool), Failure> {
     let solution = DualActiveSet::default().solve(program, start, budget)?;
     match solution.status {
         Status::Optimal | Status::PrimalInfeasible => return Ok((solution, false)),
@@ -370,7 +383,7 @@ fn solve(
         {
             Ok((general, true))
         }
-        other => Err(Failure::Numerical(format!("both solvers gave up: {other:?}")).into()),
+        other => Err(Failure::Numerical(format!("both solvers gave up: {other:?}"))),
     }
 }
 
