@@ -19,7 +19,7 @@ use vbar_guidance::{
     frames::{InFrame, RelativeState},
     mission::{AvoidanceRegion, AvoidanceSet, Thrusters},
     orbit::KeplerOrbit,
-    program::{HalfSpaces, RegulatorProgram, StateCut, nearest_point_of_polytope},
+    program::{PolytopeView, RegulatorProgram, StateCut, nearest_point_of_polytope},
     reach::{
         AbortQuestion, EllipsoidUnion, NearEllipsoid, PassiveQuestion, PolytopeQuestion,
         PolytopeUnion, cut_off_ellipsoid, cut_off_ellipsoids, cut_off_polytopes, find_abort,
@@ -280,7 +280,7 @@ fn active_union_of_254_modes_on_an_elliptic_orbit(bencher: divan::Bencher<'_, '_
 fn table_2_distance_to_a_polytope(bencher: divan::Bencher<'_, '_>) {
     let cube = cube();
     let x = DVector::from_vec(vec![90.0, 150.0, -30.0, 0.2, -2.7, 0.1]);
-    let sides = HalfSpaces { normals: cube.normals(), offsets: cube.offsets() };
+    let sides = PolytopeView { normals: cube.normals(), offsets: cube.offsets() };
     bencher.bench_local(|| nearest_point_of_polytope(sides, &x).unwrap());
 }
 

@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
 use crate::{
     matrices::symmetric_eigenvalues,
-    program::{HalfSpaces, nearest_point_of_polytope},
+    program::{PolytopeView, nearest_point_of_polytope},
     sets::{CentredEllipsoid, Polytope},
 };
 
@@ -167,7 +167,7 @@ impl AvoidanceSet {
         let rows: Vec<usize> = (0..lifted.offsets().len()).filter(of_positions).collect();
         let normals = lifted.normals().select_rows(&rows).columns(0, 3).into_owned();
         let offsets = lifted.offsets().select_rows(&rows);
-        let sides = HalfSpaces { normals: &normals, offsets: &offsets };
+        let sides = PolytopeView { normals: &normals, offsets: &offsets };
         nearest_point_of_polytope(sides, &point).map_or(f64::INFINITY, away)
     }
 

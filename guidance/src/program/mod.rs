@@ -35,7 +35,7 @@ pub use regulator::{
 };
 pub use second_order::{Affine, ConeProgram, ConeSolution};
 pub use separation::{
-    HalfSpaces, Separation, SeparationOutcome, nearest_point_of_polytope, polytope_is_empty,
+    PolytopeView, Separation, SeparationOutcome, nearest_point_of_polytope, polytope_is_empty,
     separate_from_ellipsoids, separate_from_polytopes,
 };
 pub use tables::PlantTables;

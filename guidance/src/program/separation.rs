@@ -12,9 +12,9 @@ use nalgebra::{DMatrix, DVector};
 use super::{DenseRows, DualActiveSet, QuadraticCost, QuadraticProgram, Status};
 use crate::{budget::Budget, matrices::times_vector};
 
-/// {y : normals y <= offsets}: normals q x n, offsets q.
+/// A polytope that lies elsewhere, {y : normals y <= offsets}: normals q x n, offsets q.
 #[derive(Debug, Clone, Copy)]
-pub struct HalfSpaces<'a> {
+pub struct PolytopeView<'a> {
     /// q x n.
     pub normals: &'a DMatrix<f64>,
     /// q.
@@ -49,7 +49,7 @@ pub enum SeparationOutcome {
 /// A common half-space rarely exists for many sets; the method takes one for each set instead,
 /// which has a closed form. This program is the general case and the check on it.
 #[must_use]
-pub fn separate_from_polytopes(sets: &[HalfSpaces<'_>], x: &DVector<f64>) -> SeparationOutcome {
+pub fn separate_from_polytopes(sets: &[PolytopeView<'_>], x: &DVector<f64>) -> SeparationOutcome {
     let n = x.len();
     let units = row_units(sets, n);
     // Variables: h in units (n), s, then the multipliers of each set's rows.
@@ -139,7 +139,7 @@ pub fn polytope_is_empty(normals: &DMatrix<f64>, offsets: &DVector<f64>) -> bool
 /// The point of a polytope nearest to x in the Euclidean norm, by the dual active set; `None` if
 /// the polytope is empty or the answer failed its verification.
 #[must_use]
-pub fn nearest_point_of_polytope(set: HalfSpaces<'_>, x: &DVector<f64>) -> Option<DVector<f64>> {
+pub fn nearest_point_of_polytope(set: PolytopeView<'_>, x: &DVector<f64>) -> Option<DVector<f64>> {
     let margins = set.offsets - times_vector(set.normals, x);
     if margins.iter().all(|&margin| margin >= 0.0) {
         return Some(x.clone());
@@ -157,7 +157,7 @@ pub fn nearest_point_of_polytope(set: HalfSpaces<'_>, x: &DVector<f64>) -> Optio
 
 /// A unit for each component of h: what makes the largest entry of its column 1 beside the largest
 /// offset.
-fn row_units(sets: &[HalfSpaces<'_>], n: usize) -> Vec<f64> {
+fn row_units(sets: &[PolytopeView<'_>], n: usize) -> Vec<f64> {
     let unit = |c: usize| {
         let largest = sets
             .iter()
@@ -235,8 +235,8 @@ mod tests {
         (DMatrix::from_row_slice(4, 2, &normals), DVector::from_row_slice(&offsets))
     }
 
-    fn of(set: &(DMatrix<f64>, DVector<f64>)) -> HalfSpaces<'_> {
-        HalfSpaces { normals: &set.0, offsets: &set.1 }
+    fn of(set: &(DMatrix<f64>, DVector<f64>)) -> PolytopeView<'_> {
+        PolytopeView { normals: &set.0, offsets: &set.1 }
     }
 
     fn with_semi_axes(axes: [f64; 2]) -> DMatrix<f64> {

@@ -6,7 +6,7 @@ use super::{EllipsoidUnion, NearEllipsoid, ReachablePolytope};
 use crate::{
     dynamics::RelativeVector,
     program::{
-        HalfSpaces, SeparationOutcome, nearest_point_of_polytope, separate_from_ellipsoids,
+        PolytopeView, SeparationOutcome, nearest_point_of_polytope, separate_from_ellipsoids,
         separate_from_polytopes,
     },
     sets::Polytope,
@@ -59,9 +59,9 @@ pub fn cut_off_polytopes<'a>(
     x: &RelativeVector,
 ) -> Option<Cut> {
     let polytopes: Vec<Polytope> = sets.map(ReachablePolytope::polytope).collect();
-    let sides: Vec<HalfSpaces<'_>> = polytopes
+    let sides: Vec<PolytopeView<'_>> = polytopes
         .iter()
-        .map(|set| HalfSpaces { normals: set.normals(), offsets: set.offsets() })
+        .map(|set| PolytopeView { normals: set.normals(), offsets: set.offsets() })
         .collect();
     common(separate_from_polytopes(&sides, &DVector::from_column_slice(x.as_slice())), x)
 }
@@ -97,7 +97,7 @@ pub fn cut_off_polytope(set: &ReachablePolytope<'_>, x: &RelativeVector) -> Opti
         return Some(Cut { normal: row(best) / length, offset, clearance: depth(best) });
     }
     let polytope = set.polytope();
-    let sides = HalfSpaces { normals: polytope.normals(), offsets: polytope.offsets() };
+    let sides = PolytopeView { normals: polytope.normals(), offsets: polytope.offsets() };
     let nearest = nearest_point_of_polytope(sides, &DVector::from_column_slice(x.as_slice()))?;
     let nearest = RelativeVector::from_column_slice(nearest.as_slice());
     let distance = (x - nearest).norm();

@@ -14,7 +14,7 @@ use vbar_guidance::{
     mission::{AvoidanceRegion, AvoidanceSet, ThrustMode, Thrusters},
     orbit::KeplerOrbit,
     program::{
-        HalfSpaces, RegulatorAnswer, RegulatorProgram, SeparationOutcome, StateCut, Status,
+        PolytopeView, RegulatorAnswer, RegulatorProgram, SeparationOutcome, StateCut, Status,
         nearest_point_of_polytope, separate_from_ellipsoids, separate_from_polytopes,
     },
     reach::{
@@ -445,8 +445,8 @@ fn polytope_of(value: &Value) -> Polytope {
     Polytope::new(matrix(&value["H"]), DVector::from_vec(numbers(&value["l"])) * KILO)
 }
 
-fn half_spaces(polytope: &Polytope) -> HalfSpaces<'_> {
-    HalfSpaces { normals: polytope.normals(), offsets: polytope.offsets() }
+fn half_spaces(polytope: &Polytope) -> PolytopeView<'_> {
+    PolytopeView { normals: polytope.normals(), offsets: polytope.offsets() }
 }
 
 fn check_ellipsoid_distance(case: &Case<'_>) {
@@ -544,7 +544,7 @@ fn check_ellipsoid_separation(case: &Case<'_>) {
 fn check_polytope_separation(case: &Case<'_>) {
     let x = dynamic(&state(&case.inputs["x"]));
     let sets: Vec<Polytope> = list(&case.inputs["sets"]).iter().map(polytope_of).collect();
-    let all: Vec<HalfSpaces<'_>> = sets.iter().map(half_spaces).collect();
+    let all: Vec<PolytopeView<'_>> = sets.iter().map(half_spaces).collect();
     let expected = case.expected;
     let common = clearance(&separate_from_polytopes(&all, &x));
     let star = number(&expected["s_star_all"]);
@@ -572,7 +572,7 @@ fn check_separation_without_origin(case: &Case<'_>) {
     let alone = separate_from_polytopes(&[half_spaces(&set)], &x);
     assert_eq!(alone, SeparationOutcome::Unbounded, "{}", case.label);
     let sets: Vec<Polytope> = list(&case.inputs["all_sets"]).iter().map(polytope_of).collect();
-    let all: Vec<HalfSpaces<'_>> = sets.iter().map(half_spaces).collect();
+    let all: Vec<PolytopeView<'_>> = sets.iter().map(half_spaces).collect();
     let star = number(&case.expected["s_star_with_S_included"]);
     let got = clearance(&separate_from_polytopes(&all, &x));
     case.near("with S", got, star, 1e-6 * star.abs());

@@ -1,6 +1,6 @@
 //! The precompute of [Mammarella2019] at its published size, on threads of this program:
 //!
-//! `cargo run --release -p vbar-guidance --example precompute -- SAMPLES THREADS [exact]`
+//! `cargo run --release -p vbar-guidance --example sampled_precompute -- SAMPLES THREADS [exact]`
 //!
 //! 7303 samples a group make the paper's 956,693 rows. Prints what each shard took, what was kept,
 //! what is certified, and a digest that does not depend on the number of threads.
