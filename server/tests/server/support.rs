@@ -131,7 +131,9 @@ impl Server {
     pub(crate) async fn metric(&self, name: &str) -> f64 {
         let answer = self.get("/metrics").await;
         let lines = answer.text().lines().filter(|line| line.starts_with(name));
-        lines.filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok()).sum()
+        let values = lines.filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok());
+        // A sum of nothing would be -0.0.
+        values.fold(0.0, |sum, value| sum + value)
     }
 }
 
